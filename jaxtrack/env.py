@@ -1,0 +1,209 @@
+"""The environment `SearchTrack-v0` in gymnax form. It holds no mathematics of its own."""
+
+from typing import Any
+
+import gymnax
+import jax
+import jax.numpy as jnp
+from flax import struct
+from gymnax.environments import environment
+
+from jaxtrack import metrics, spaces, tracker
+from jaxtrack.observation import TRACK_FEATURES, Observation, observe
+from jaxtrack.params import Params, StaticParams, check_trajectories, validate
+from jaxtrack.reward import reward_terms
+from jaxtrack.scan_map import initial_scan_map, update_scan_map
+from jaxtrack.sensor import SensorNoise, detect, look_angles, sample_noise
+from jaxtrack.truth import initiate_truths, propagate_truths
+from jaxtrack.types import Detections, Tracks, Truths
+
+ENV_ID = "SearchTrack-v0"
+
+
+@struct.dataclass
+class EnvState(environment.EnvState):
+    """State of one scenario.
+
+    Attributes:
+        time: `[]` steps since the start.
+        truths: the true targets; no policy may read them.
+        tracks: the track list.
+        scan_map: `[M, M]` scan value of every pixel.
+        num_initiated: `[]` tracks initiated since the start.
+    """
+
+    time: jax.Array
+    truths: Truths
+    tracks: Tracks
+    scan_map: jax.Array  # [M, M]
+    num_initiated: jax.Array
+
+
+@struct.dataclass
+class StepNoise:
+    """All that is random in one step.
+
+    Attributes:
+        motion: `[N, 3, 2]` standard normal, the truths' accelerations.
+        sensor: the draws of the look.
+    """
+
+    motion: jax.Array  # [N, 3, 2]
+    sensor: SensorNoise
+
+
+@struct.dataclass
+class StepRecord:
+    """What happened in one step, for rendering and parity tests.
+
+    Attributes:
+        look: `[2]` boresight azimuth and elevation (rad).
+        detections: what the look returned.
+        num_dropped_detections: `[]` detections for which no slot was free.
+        tracker: every intermediate of the tracker.
+    """
+
+    look: jax.Array
+    detections: Detections
+    num_dropped_detections: jax.Array
+    tracker: tracker.TrackerInfo
+
+
+class SearchTrack(environment.Environment[EnvState, Params]):
+    """Search and track with a steerable radar (paper, section III).
+
+    Observation, action, reward and termination: see `jaxtrack/README.md`.
+    """
+
+    def __init__(self, static: StaticParams | None = None, **shapes: Any) -> None:
+        """Takes the shapes as a `StaticParams`, as keywords, or both.
+
+        Raises:
+            ValueError: naming the field, if a shape makes no sense.
+            TypeError: if a keyword is no field of `StaticParams`.
+        """
+        base = static or StaticParams()
+        self.static = StaticParams(**{**vars(base), **shapes})
+
+    @property
+    def name(self) -> str:
+        """Registered name."""
+        return ENV_ID
+
+    @property
+    def default_params(self) -> Params:
+        """The scenario of the paper."""
+        return Params()
+
+    @property
+    def num_actions(self) -> int:
+        """Number of discrete looks."""
+        return self.static.num_looks**2
+
+    def reset_env(self, key: jax.Array, params: Params) -> tuple[Observation, EnvState]:
+        """New truths, no tracks, a field never seen."""
+        check_trajectories(self.static, params)
+        state = EnvState(
+            time=jnp.asarray(0),
+            truths=initiate_truths(key, self.static, params),
+            tracks=Tracks.empty(self.static.max_tracks),
+            scan_map=initial_scan_map(self.static),
+            num_initiated=jnp.asarray(0),
+        )
+        return self.observe(key, state, None, params), state
+
+    def step_env(
+        self, key: jax.Array, state: EnvState, action: jax.Array, params: Params
+    ) -> tuple[Observation, EnvState, jax.Array, jax.Array, dict[str, jax.Array]]:
+        """One step: observation, state, reward, terminated (never), info."""
+        before = state
+        state, record = self.advance(state, action, self.sample_noise(key), params)
+        terms = reward_terms(before.tracks, state.tracks, state.scan_map, self.static, params)
+        info = step_info(state, record, terms, params)
+        observation = self.observe(key, state, action, params)
+        return observation, state, terms[0] + terms[1], self.is_terminated(state, params), info
+
+    def advance(
+        self, state: EnvState, action: jax.Array, noise: StepNoise, params: Params
+    ) -> tuple[EnvState, StepRecord]:
+        """The deterministic core: truths move, the radar looks, the tracker runs."""
+        time = state.time + 1
+        truths = propagate_truths(state.truths, noise.motion, time, params)
+        look = look_angles(action, self.static, params)
+        detections, num_dropped = detect(truths, look, noise.sensor, self.static, params)
+        tracks, info = tracker.step(state.tracks, detections, params.time_step, time, params)
+        scan_map = update_scan_map(state.scan_map, look, self.static, params)
+        num_initiated = state.num_initiated + jnp.sum(info.initiated)
+        state = EnvState(time, truths, tracks, scan_map, num_initiated)
+        return state, StepRecord(look, detections, num_dropped, info)
+
+    def sample_noise(self, key: jax.Array) -> StepNoise:
+        """Draws all that is random in one step; the key is consumed."""
+        key_motion, key_sensor = jax.random.split(key)
+        motion = jax.random.normal(key_motion, (self.static.num_truths, 3, 2))
+        return StepNoise(motion=motion, sensor=sample_noise(key_sensor, self.static))
+
+    def observe(
+        self, key: jax.Array, state: EnvState, action: jax.Array | None, params: Params
+    ) -> Observation:
+        """Track list, mask and scan map; deterministic."""
+        del key, action
+        return observe(state.tracks, state.scan_map, params)
+
+    def is_terminated(self, state: EnvState, params: Params) -> jax.Array:
+        """Never: episodes end by truncation only."""
+        del state, params
+        return jnp.asarray(False)
+
+    def action_space(self, params: Params) -> spaces.Box | spaces.Indices:
+        """Two integers in [0, num_looks), or two angles in rad."""
+        if self.static.continuous_actions:
+            return spaces.Box(-params.field_limit, params.field_limit, (2,), jnp.float32)
+        return spaces.Indices(self.static.num_looks, (2,))
+
+    def observation_space(self, params: Params) -> spaces.Dict:
+        """Dictionary of track features, mask and scan map."""
+        del params
+        tracks, pixels = self.static.max_tracks, self.static.map_size
+        return spaces.Dict(
+            {
+                "tracks": spaces.Box(-jnp.inf, jnp.inf, (tracks, TRACK_FEATURES), jnp.float32),
+                "mask": spaces.Box(0, 1, (tracks,), jnp.bool_),
+                "scan_map": spaces.Box(0.0, 1.0, (pixels, pixels), jnp.float32),
+            }
+        )
+
+
+def step_info(
+    state: EnvState, record: StepRecord, terms: tuple[jax.Array, jax.Array], params: Params
+) -> dict[str, jax.Array]:
+    """What a user wants to log of one step; every entry is a scalar."""
+    return {
+        "live_tracks": jnp.sum(state.tracks.active),
+        "completeness": metrics.completeness(state.truths, state.tracks, params),
+        "covariance_norm_sum": metrics.covariance_norm_sum(state.tracks),
+        "covariance_norm_mean": metrics.covariance_norm_mean(state.tracks),
+        "mean_scan_value": jnp.mean(state.scan_map),
+        "reward_track": terms[0],
+        "reward_search": terms[1],
+        "num_detections": jnp.sum(record.detections.active),
+        "dropped_detections": record.num_dropped_detections,
+        "dropped_tracks": record.tracker.num_dropped,
+    }
+
+
+def make(
+    params: Params | None = None, static: StaticParams | None = None, **shapes: Any
+) -> tuple[SearchTrack, Params]:
+    """The environment and its parameters, both checked.
+
+    Raises:
+        ValueError: naming the wrong field and its range.
+    """
+    env = SearchTrack(static, **shapes)
+    params = env.default_params if params is None else params
+    validate(env.static, params)
+    return env, params
+
+
+gymnax.register(ENV_ID, SearchTrack)

@@ -1,0 +1,80 @@
+"""How tracks end and begin.
+
+Counterparts in Stone Soup: `CovarianceBasedDeleter`, `SimpleMeasurementInitiator`.
+"""
+
+import jax
+import jax.numpy as jnp
+
+from jaxtrack.kalman import measurement_noise
+from jaxtrack.models import inverse_elevation_bearing_range, inverse_jacobian
+from jaxtrack.params import Params
+from jaxtrack.types import NO_DETECTION, POSITION, VELOCITY, Detections, Tracks, where_rows
+
+
+def delete_uncertain_tracks(tracks: Tracks, params: Params) -> Tracks:
+    """Deletes tracks whose covariance trace over all six states exceeds the threshold.
+
+    Strictly: a track exactly at the threshold lives. Runs after the update and before
+    initiation, so that a track can not die on the step of its birth.
+    """
+    trace = jnp.trace(tracks.covariance, axis1=-2, axis2=-1)
+    return tracks.replace(active=tracks.active & ~(trace > params.deletion_threshold))
+
+
+def unassociated(detections: Detections, associated: jax.Array) -> jax.Array:
+    """`[D]` whether a detection was used by no track, not even by one just deleted."""
+    used = jnp.any(associated[:, None] == jnp.arange(detections.active.shape[0]), axis=0)
+    return detections.active & ~used
+
+
+def initiate_tracks(
+    tracks: Tracks, detections: Detections, is_unassociated: jax.Array, step: jax.Array, params: Params
+) -> tuple[Tracks, jax.Array]:
+    """Starts a track from every unassociated detection, in order, in the first free slots.
+
+    Args:
+        tracks: the surviving tracks.
+        detections: what the look returned.
+        is_unassociated: `[D]` which detections start a track.
+        step: index of this step, the birth step of the new tracks.
+        params: numbers of the tracker.
+
+    Returns:
+        The track list, and the number of detections for which no slot was free.
+    """
+    # The k-th free slot takes the k-th unassociated detection.
+    is_free = ~tracks.active
+    rank = jnp.cumsum(is_free) - 1
+    queue = jnp.argsort(~is_unassociated, stable=True)
+    num_waiting = jnp.sum(is_unassociated)
+    born = is_free & (rank < num_waiting)
+    source = queue[jnp.clip(rank, 0, queue.shape[0] - 1)]
+
+    mean, covariance = jax.vmap(initial_estimate, in_axes=(0, None))(detections.value, params)
+    initiated = Tracks(
+        mean=where_rows(born, mean[source], tracks.mean),
+        covariance=where_rows(born, covariance[source], tracks.covariance),
+        active=tracks.active | born,
+        updated_by=jnp.where(born, source, jnp.where(tracks.active, tracks.updated_by, NO_DETECTION)),
+        birth_step=jnp.where(born, step, tracks.birth_step),
+        birth_detection=jnp.where(born, source, tracks.birth_detection),
+        age=jnp.where(born, 0, tracks.age),
+    )
+    return initiated, num_waiting - jnp.sum(born)
+
+
+def initial_estimate(detection: jax.Array, params: Params) -> tuple[jax.Array, jax.Array]:
+    """State and covariance of a track from one detection `[3]`.
+
+    The position is the inverse measurement with covariance ``G R G^T``, G the exact Jacobian
+    of the inverse; the velocity is the prior's, zero with `prior_velocity_sigma`.
+    """
+    G = inverse_jacobian(detection)
+    mean = jnp.zeros(6).at[jnp.array(POSITION)].set(inverse_elevation_bearing_range(detection))
+    position_covariance = G @ measurement_noise(params) @ G.T
+    velocity_covariance = params.prior_velocity_sigma**2 * jnp.eye(3)
+    covariance = jnp.zeros((6, 6))
+    covariance = covariance.at[jnp.ix_(jnp.array(POSITION), jnp.array(POSITION))].set(position_covariance)
+    covariance = covariance.at[jnp.ix_(jnp.array(VELOCITY), jnp.array(VELOCITY))].set(velocity_covariance)
+    return mean, covariance

@@ -1,0 +1,62 @@
+"""What the agent sees: the track list, its mask, and the scan map (paper, eq. 3 to 5)."""
+
+import jax
+import jax.numpy as jnp
+
+from jaxtrack.models import elevation_bearing_range
+from jaxtrack.params import Params
+from jaxtrack.types import Tracks, velocity
+
+TRACK_FEATURES = 7
+"""Range, azimuth, elevation, vx, vy, vz, Frobenius norm of the covariance."""
+
+Observation = dict[str, jax.Array]
+
+
+def observe(tracks: Tracks, scan_map: jax.Array, params: Params) -> Observation:
+    """The observation.
+
+    Returns:
+        `tracks` `[T, 7]` scaled features, zero where there is no track; `mask` `[T]` where
+        there is one; `scan_map` `[M, M]` in [0, 1].
+    """
+    features = track_features(tracks) / feature_scales(params)
+    # Reading row r of a slot that is empty must give exact zeros, whatever it holds.
+    padded = jnp.where(tracks.active[:, None], features, 0.0)
+    return {"tracks": padded, "mask": tracks.active, "scan_map": scan_map}
+
+
+def track_features(tracks: Tracks) -> jax.Array:
+    """Unscaled features `[T, 7]`: m, rad, rad, m/s three times, m^2."""
+    elevation, azimuth, distance = jnp.moveaxis(elevation_bearing_range(tracks.mean), -1, 0)
+    norm = covariance_norms(tracks)
+    return jnp.concatenate(
+        [
+            jnp.stack([distance, azimuth, elevation], axis=-1),
+            velocity(tracks.mean),
+            norm[:, None],
+        ],
+        axis=-1,
+    )
+
+
+def feature_scales(params: Params) -> jax.Array:
+    """Fixed divisors `[7]` that bring the features near [-1, 1]."""
+    speed = 3 * params.prior_velocity_sigma
+    return jnp.array(
+        [
+            params.max_range,
+            params.field_limit,
+            params.field_limit,
+            speed,
+            speed,
+            speed,
+            params.deletion_threshold,
+        ],
+        dtype=float,
+    )
+
+
+def covariance_norms(tracks: Tracks) -> jax.Array:
+    """Frobenius norm `[T]` of every slot's 6x6 covariance, mixed units as in Stone Soup."""
+    return jnp.sqrt(jnp.sum(tracks.covariance**2, axis=(-2, -1)))

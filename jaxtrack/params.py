@@ -1,0 +1,182 @@
+"""Every number of the scenario, the tracker and the reward, once, with its unit.
+
+`StaticParams` are shapes and choices of code: hashable, changing one recompiles.
+`Params` are numbers: traced, so that changing them recompiles nothing and `jax.vmap` over
+them gives curricula and domain randomisation.
+"""
+
+import dataclasses
+import math
+from typing import Any
+
+import jax
+import numpy as np
+from flax import struct
+
+REWARDS = ("paper", "as_printed", "information")
+
+
+def looks_per_axis(field: float, beam: float) -> int:
+    """Looks per axis so that overlapping beams cover the field (paper, eq. 1).
+
+    Args:
+        field: total extent of the field (rad).
+        beam: extent of the beam (rad).
+    """
+    return math.ceil(round(field / (beam * math.sqrt(2) / 2), 9))
+
+
+@dataclasses.dataclass(frozen=True)
+class StaticParams:
+    """Shapes and choices of code (hashable; a change recompiles)."""
+
+    num_truths: int = 10
+    """Truths, all alive from the start (replayed trajectories may say otherwise)."""
+    max_tracks: int = 20
+    """Track slots; an excess is dropped and counted in `info`."""
+    max_detections: int = 10
+    """Detection slots per look; an excess is dropped and counted in `info`."""
+    max_clutter: int = 8
+    """Largest number of false detections in one look."""
+    map_size: int = 48
+    """Pixels along each side of the scan map."""
+    num_looks: int = 19
+    """Looks along each axis of the field."""
+    continuous_actions: bool = False
+    """Actions are (azimuth, elevation) in radians instead of two look indices."""
+    reward: str = "paper"
+    """Reward by name: paper, as_printed or information."""
+
+    def __post_init__(self) -> None:
+        """Refuses shapes that make no sense, naming the field."""
+        low = {"max_clutter": 0, "map_size": 2, "num_looks": 2}
+        for field in dataclasses.fields(self):
+            value = getattr(self, field.name)
+            if field.type is int and (
+                isinstance(value, bool) or not isinstance(value, int) or value < low.get(field.name, 1)
+            ):
+                raise ValueError(
+                    f"{field.name} = {value!r}: expected an integer >= {low.get(field.name, 1)}"
+                )
+        if self.reward not in REWARDS:
+            raise ValueError(f"reward = {self.reward!r}: expected one of {', '.join(REWARDS)}")
+
+
+def _quantity(default: float, unit: str, low: float, high: float = math.inf, open_low: bool = False) -> Any:
+    """A traced number with its unit and the range that `validate` allows."""
+    return struct.field(
+        default=default,
+        metadata={"unit": unit, "low": low, "high": high, "open_low": open_low},
+    )
+
+
+@struct.dataclass
+class Params:
+    """Numbers of the scenario, the tracker and the reward (traced; a change recompiles nothing)."""
+
+    time_step: float = _quantity(0.005, "s", 0.0, open_low=True)
+    """Time between looks (s)."""
+    max_steps_in_episode: int = _quantity(1000, "steps", 1)  # gymnax reads this name
+    """Length of an episode (steps)."""
+
+    field_limit: float = _quantity(math.pi / 3, "rad", 0.0, math.pi / 2, open_low=True)
+    """Azimuth and elevation of the field lie within plus or minus this (rad)."""
+    beam_azimuth: float = _quantity(math.radians(9), "rad", 0.0, math.pi, open_low=True)
+    """Full width of the beam in boresight bearing (rad)."""
+    beam_elevation: float = _quantity(math.radians(9), "rad", 0.0, math.pi, open_low=True)
+    """Full width of the beam in boresight elevation (rad)."""
+
+    min_range: float = _quantity(1_000.0, "m", 0.0, open_low=True)
+    """Smallest range at which a truth is born (m)."""
+    max_range: float = _quantity(10_000.0, "m", 0.0, open_low=True)
+    """Largest range at which a truth is born; scale of the range observation (m)."""
+    truth_velocity_sigma: float = _quantity(30.0, "m/s", 0.0)
+    """Standard deviation of a truth's initial velocity, each axis (m/s)."""
+    truth_process_noise: float = _quantity(1.0, "m^2/s^3", 0.0)
+    """Spectral density of the truths' white acceleration; 0 switches it off (m^2/s^3)."""
+    trajectories: jax.Array | None = None
+    """Recorded truths `[K, N, 6]` to replay instead of simulating; NaN where absent."""
+
+    elevation_sigma: float = _quantity(2e-3, "rad", 0.0, open_low=True)
+    """Standard deviation of measured elevation (rad)."""
+    bearing_sigma: float = _quantity(2e-3, "rad", 0.0, open_low=True)
+    """Standard deviation of measured bearing (rad)."""
+    range_sigma: float = _quantity(5.0, "m", 0.0, open_low=True)
+    """Standard deviation of measured range (m)."""
+    detection_probability: float = _quantity(1.0, "1", 0.0, 1.0)
+    """Probability that a truth in the beam is detected."""
+    clutter_rate: float = _quantity(0.0, "1/look", 0.0)
+    """Expected number of false detections per look."""
+
+    process_noise: float = _quantity(1.0, "m^2/s^3", 0.0)
+    """Spectral density of the white acceleration that the filter assumes (m^2/s^3)."""
+    alpha: float = _quantity(0.5, "1", 0.0, open_low=True)
+    """Unscented transform: primary spread of the sigma points."""
+    beta: float = _quantity(2.0, "1", 0.0)
+    """Unscented transform: prior knowledge of the distribution (2 is best for a Gaussian)."""
+    kappa: float = _quantity(-3.0, "1", -6.0, open_low=True)
+    """Unscented transform: secondary spread of the sigma points."""
+    gate_threshold: float = _quantity(5.0, "1", 0.0, open_low=True)
+    """A detection is considered if its Mahalanobis distance is smaller than this."""
+    missed_distance: float = _quantity(5.0, "1", 0.0, open_low=True)
+    """Distance at which a missed detection is the better explanation."""
+    prior_velocity_sigma: float = _quantity(30.0, "m/s", 0.0, open_low=True)
+    """Standard deviation of a new track's velocity, each axis (m/s)."""
+    deletion_threshold: float = _quantity(5_000.0, "m^2 + m^2/s^2", 0.0, open_low=True)
+    """A track is deleted when the trace of its covariance exceeds this."""
+
+    scan_time_constant: float = _quantity(1.0, "s", 0.0, open_low=True)
+    """Time in which the scan value of an unobserved direction recovers to 1 - 1/e (s)."""
+    track_weight: float = _quantity(1.0, "1", 0.0)
+    """Weight of the reward's track term."""
+    search_weight: float = _quantity(0.5, "1", 0.0)
+    """Weight of the reward's search term."""
+    gospa_cutoff: float = _quantity(200.0, "m", 0.0, open_low=True)
+    """GOSPA cut-off c; also the distance within which a track counts for a truth (m)."""
+    gospa_order: float = _quantity(2.0, "1", 1.0)
+    """GOSPA order p."""
+
+
+def validate(static: StaticParams, params: Params) -> None:
+    """Checks every number against its range; call it on the host, once.
+
+    Raises:
+        ValueError: naming the field, its value, and the range allowed.
+    """
+    for field in dataclasses.fields(params):
+        if field.metadata and "low" in field.metadata:
+            _check_quantity(field, getattr(params, field.name))
+    if np.any(np.asarray(params.min_range) > np.asarray(params.max_range)):
+        raise ValueError(
+            f"min_range = {params.min_range}: expected at most max_range = {params.max_range} m"
+        )
+    if np.any(np.asarray(params.clutter_rate) > static.max_clutter):
+        raise ValueError(
+            f"clutter_rate = {params.clutter_rate}: expected at most max_clutter = "
+            f"{static.max_clutter} 1/look"
+        )
+    check_trajectories(static, params)
+
+
+def check_trajectories(static: StaticParams, params: Params) -> None:
+    """Raises ValueError when replayed trajectories do not fit the number of truths."""
+    if params.trajectories is not None:
+        shape = np.shape(params.trajectories)[-3:]
+        if len(shape) != 3 or shape[0] < 1 or shape[1:] != (static.num_truths, 6):
+            raise ValueError(
+                f"trajectories has shape {np.shape(params.trajectories)}: expected "
+                f"[times, num_truths = {static.num_truths}, 6]"
+            )
+
+
+def _check_quantity(field: dataclasses.Field, value: Any) -> None:
+    low, high = field.metadata["low"], field.metadata["high"]
+    bracket = "(" if field.metadata["open_low"] else "["
+    expected = f"expected a number in {bracket}{low:g}, {high:g}] {field.metadata['unit']}"
+    try:
+        numbers = np.asarray(value, dtype=float)
+    except (TypeError, ValueError):
+        raise ValueError(f"{field.name} = {value!r}: {expected}") from None
+    above = numbers > low if field.metadata["open_low"] else numbers >= low
+    if not np.all(np.isfinite(numbers) & above & (numbers <= high)):
+        raise ValueError(f"{field.name} = {value}: {expected}")

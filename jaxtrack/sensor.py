@@ -1,0 +1,168 @@
+"""The steerable radar: where it looks, what its beam holds, what it detects.
+
+Counterpart in Stone Soup: `RadarRotatingElevationBearingRange`. Its field of view is tested
+in the boresight frame, edges included; detections are given in the platform frame.
+"""
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+from jaxtrack.models import direction, spherical, wrap_detection
+from jaxtrack.params import Params, StaticParams
+from jaxtrack.types import NO_TRUTH, Detections, Truths, position
+
+
+@struct.dataclass
+class SensorNoise:
+    """The random draws of one look.
+
+    Attributes:
+        detection: `[N, 3]` standard normal, scaled by the measurement sigmas.
+        detected: `[N]` uniform in [0, 1), below the detection probability is detected.
+        clutter_count: `[]` uniform, turned into a Poisson number.
+        clutter: `[C, 3]` uniform places of false detections in the beam.
+    """
+
+    detection: jax.Array  # [N, 3]
+    detected: jax.Array  # [N]
+    clutter_count: jax.Array  # []
+    clutter: jax.Array  # [C, 3]
+
+
+def sample_noise(key: jax.Array, static: StaticParams) -> SensorNoise:
+    """Draws all that is random in one look; the key is consumed."""
+    key_normal, key_uniform = jax.random.split(key)
+    n, c = static.num_truths, static.max_clutter
+    uniform = jax.random.uniform(key_uniform, (n + 1 + 3 * c,))
+    return SensorNoise(
+        detection=jax.random.normal(key_normal, (n, 3)),
+        detected=uniform[:n],
+        clutter_count=uniform[n],
+        clutter=uniform[n + 1 :].reshape(c, 3),
+    )
+
+
+def look_angles(action: jax.Array, static: StaticParams, params: Params) -> jax.Array:
+    """Boresight `[..., 2]` (azimuth, elevation in rad) of an action (paper, eq. 2).
+
+    Discrete actions are two indices, ``angle = limit (2 a / (N_a - 1) - 1)``; continuous ones
+    are the angles themselves. Values outside the field are moved to its edge; a NaN angle
+    looks nowhere.
+    """
+    if static.continuous_actions:
+        return jnp.clip(jnp.asarray(action, dtype=float), -params.field_limit, params.field_limit)
+    last = static.num_looks - 1
+    index = jnp.clip(action, 0, last)
+    return params.field_limit * (2 * index / last - 1)
+
+
+def boresight_frame(points: jax.Array, look: jax.Array) -> jax.Array:
+    """Points `[..., 3]` turned so that the look `[2]` lies along x."""
+    cos_az, sin_az = jnp.cos(look[0]), jnp.sin(look[0])
+    cos_el, sin_el = jnp.cos(look[1]), jnp.sin(look[1])
+    x, y, z = points[..., 0], points[..., 1], points[..., 2]
+    forward = cos_az * x + sin_az * y
+    return jnp.stack(
+        [
+            cos_el * forward + sin_el * z,
+            cos_az * y - sin_az * x,
+            cos_el * z - sin_el * forward,
+        ],
+        axis=-1,
+    )
+
+
+def platform_frame(points: jax.Array, look: jax.Array) -> jax.Array:
+    """Inverse of `boresight_frame`."""
+    cos_az, sin_az = jnp.cos(look[0]), jnp.sin(look[0])
+    cos_el, sin_el = jnp.cos(look[1]), jnp.sin(look[1])
+    x, y, z = points[..., 0], points[..., 1], points[..., 2]
+    forward = cos_el * x - sin_el * z
+    return jnp.stack(
+        [cos_az * forward - sin_az * y, sin_az * forward + cos_az * y, cos_el * z + sin_el * x],
+        axis=-1,
+    )
+
+
+def in_beam(points: jax.Array, look: jax.Array, params: Params) -> jax.Array:
+    """`[...]` whether points `[..., 3]` lie in the beam of a look `[2]`, edges included.
+
+    Boresight bearing and elevation within half the beam's widths; written without arcs:
+    ``|y| <= tan(b/2) x`` and ``|z| <= sin(e/2) r``.
+    """
+    turned = boresight_frame(points, look)
+    x, y, z = turned[..., 0], turned[..., 1], turned[..., 2]
+    half_bearing, half_elevation = params.beam_azimuth / 2, params.beam_elevation / 2
+    in_bearing = jnp.abs(y) * jnp.cos(half_bearing) <= jnp.sin(half_bearing) * x
+    radius_squared = x**2 + y**2 + z**2
+    in_elevation = z**2 <= jnp.sin(half_elevation) ** 2 * radius_squared
+    return in_bearing & in_elevation
+
+
+def detect(
+    truths: Truths, look: jax.Array, noise: SensorNoise, static: StaticParams, params: Params
+) -> tuple[Detections, jax.Array]:
+    """What a look `[2]` (rad) returns: truths in the beam, then clutter, in order.
+
+    Returns:
+        The detections, and how many found no slot or exceeded `max_clutter`.
+    """
+    sigmas = jnp.array([params.elevation_sigma, params.bearing_sigma, params.range_sigma], dtype=float)
+    points = position(truths.state)
+    seen = truths.alive & in_beam(points, look, params)
+    seen &= noise.detected < params.detection_probability
+    value = wrap_detection(spherical(points) + sigmas * noise.detection)
+
+    num_clutter, excess = clutter_count(noise.clutter_count, static, params)
+    is_clutter = jnp.arange(static.max_clutter) < num_clutter
+    false_value = spherical(clutter_points(noise.clutter, look, params))
+
+    detections, num_dropped = _compact(
+        jnp.concatenate([value, false_value]),
+        jnp.concatenate([seen, is_clutter]),
+        jnp.concatenate([jnp.arange(static.num_truths), jnp.full(static.max_clutter, NO_TRUTH)]),
+        static.max_detections,
+    )
+    return detections, num_dropped + excess
+
+
+def clutter_count(
+    uniform: jax.Array, static: StaticParams, params: Params
+) -> tuple[jax.Array, jax.Array]:
+    """Poisson number of false detections from one uniform draw, and its excess over capacity."""
+    counts = jnp.arange(4 * static.max_clutter)
+    rate = jnp.asarray(params.clutter_rate, dtype=float)
+    # Terms rate^k / k! by a running product: no logarithm of a zero rate.
+    terms = jnp.cumprod(jnp.where(counts == 0, jnp.exp(-rate), rate / jnp.maximum(counts, 1)))
+    number = jnp.sum(uniform >= jnp.cumsum(terms)) if static.max_clutter else jnp.asarray(0)
+    # Rounding of the last sums must not make clutter where the rate is zero.
+    number = jnp.where(rate > 0, number, 0)
+    return jnp.minimum(number, static.max_clutter), jnp.maximum(number - static.max_clutter, 0)
+
+
+def clutter_points(uniform: jax.Array, look: jax.Array, params: Params) -> jax.Array:
+    """Places `[C, 3]` (m) of false detections, uniform in the beam's angles and in range."""
+    bearing = params.beam_azimuth * (uniform[:, 0] - 0.5)
+    elevation = params.beam_elevation * (uniform[:, 1] - 0.5)
+    distance = params.min_range + (params.max_range - params.min_range) * uniform[:, 2]
+    return platform_frame(distance[:, None] * direction(bearing, elevation), look)
+
+
+def _compact(
+    value: jax.Array, active: jax.Array, truth: jax.Array, capacity: int
+) -> tuple[Detections, jax.Array]:
+    """Moves the active rows to the front, keeps `capacity` of them, counts the rest."""
+    rows = active.shape[0]
+    if rows < capacity:
+        padding = capacity - rows
+        value = jnp.pad(value, ((0, padding), (0, 0)))
+        active, truth = jnp.pad(active, (0, padding)), jnp.pad(truth, (0, padding))
+    order = jnp.argsort(~active, stable=True)[:capacity]
+    kept = active[order]
+    detections = Detections(
+        value=jnp.where(kept[:, None], value[order], 0.0),
+        active=kept,
+        truth=jnp.where(kept, truth[order], NO_TRUTH),
+    )
+    return detections, jnp.sum(active) - jnp.sum(kept)

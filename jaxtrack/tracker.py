@@ -1,0 +1,88 @@
+"""One cycle of the multi-target tracker. It stands alone: no environment is needed.
+
+Counterpart in Stone Soup: `MultiTargetTracker`.
+"""
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+from jaxtrack import association, kalman, lifecycle
+from jaxtrack.kalman import ExpectedDetections
+from jaxtrack.params import Params
+from jaxtrack.types import STATE_DIM, Detections, Tracks, where_rows
+
+
+@struct.dataclass
+class TrackerInfo:
+    """Every intermediate of one step, for parity tests and diagnosis.
+
+    Attributes:
+        predicted: the track list predicted to this step.
+        expected: measurement prediction of every track.
+        distances: `[T, D]` Mahalanobis distances before the gate.
+        associated: `[T]` index of each track's detection, or `NO_DETECTION`.
+        updated: the track list after the update, before deletion.
+        deleted: `[T]` which tracks were deleted on this step.
+        initiated: `[T]` which slots hold a track born on this step.
+        num_dropped: new tracks for which no slot was free.
+    """
+
+    predicted: Tracks
+    expected: ExpectedDetections
+    distances: jax.Array  # [T, D]
+    associated: jax.Array  # [T] int
+    updated: Tracks
+    deleted: jax.Array  # [T] bool
+    initiated: jax.Array  # [T] bool
+    num_dropped: jax.Array  # [] int
+
+
+def step(
+    tracks: Tracks, detections: Detections, time_step: jax.Array, index: jax.Array, params: Params
+) -> tuple[Tracks, TrackerInfo]:
+    """Predict, gate, associate, update, delete, initiate: in Stone Soup's order.
+
+    Args:
+        tracks: the track list after the previous step.
+        detections: what the look returned; none active is fine.
+        time_step: time since the previous step (s).
+        index: number of this step, which becomes the birth step of new tracks.
+        params: numbers of the tracker.
+
+    Returns:
+        The track list after this step, and all intermediates.
+    """
+    tracks, detections = _blank_empty_rows(tracks, detections, params)
+    predicted = kalman.predict(tracks, time_step, params)
+    expected = kalman.predict_detections(predicted, params)
+    distances = association.mahalanobis_distances(expected, detections)
+    admissible = association.gate(distances, predicted, detections, params)
+    associated = association.associate_nearest_neighbour(admissible)
+    updated = kalman.update(predicted, expected, detections, associated)
+    surviving = lifecycle.delete_uncertain_tracks(updated, params)
+    new = lifecycle.unassociated(detections, associated)
+    tracks, num_dropped = lifecycle.initiate_tracks(surviving, detections, new, index, params)
+    return tracks, TrackerInfo(
+        predicted=predicted,
+        expected=expected,
+        distances=distances,
+        associated=associated,
+        updated=updated,
+        deleted=updated.active & ~surviving.active,
+        initiated=tracks.active & ~surviving.active,
+        num_dropped=num_dropped,
+    )
+
+
+def _blank_empty_rows(
+    tracks: Tracks, detections: Detections, params: Params
+) -> tuple[Tracks, Detections]:
+    """Puts harmless numbers into empty rows, so that neither values nor gradients turn NaN."""
+    somewhere = jnp.zeros(STATE_DIM).at[0].set(params.min_range)
+    tracks = tracks.replace(
+        mean=where_rows(tracks.active, tracks.mean, somewhere),
+        covariance=where_rows(tracks.active, tracks.covariance, jnp.eye(STATE_DIM)),
+    )
+    origin = jnp.zeros(3).at[2].set(params.min_range)
+    return tracks, detections.replace(value=where_rows(detections.active, detections.value, origin))
