@@ -1,0 +1,142 @@
+"""Baseline policies behind one signature: `policy(key, state) -> action`.
+
+The key belongs to the episode, not to the step: a policy that wants fresh draws folds the
+time into it. Rules read the track list, the scan map and the clock, never the truths.
+
+    policy = POLICIES["index"](static, params)
+    action = policy(key, state)
+"""
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+import jax
+import jax.numpy as jnp
+
+from jaxtrack.models import elevation_bearing_range
+from jaxtrack.params import Params, StaticParams
+from jaxtrack.scan_map import beam_weights, look_grid
+from jaxtrack.sensor import in_beam
+from jaxtrack.types import Tracks, position
+
+if TYPE_CHECKING:
+    from jaxtrack.env import EnvState
+
+Policy = Callable[[jax.Array, "EnvState"], jax.Array]
+
+REVISIT_SHARE = 0.6
+"""The scheduler rule revisits a track whose trace passes this share of the threshold."""
+
+
+def random(static: StaticParams, params: Params) -> Policy:
+    """A look drawn uniformly at every step (paper)."""
+
+    def policy(key: jax.Array, state: "EnvState") -> jax.Array:
+        key = jax.random.fold_in(key, state.time)
+        return to_action(jax.random.randint(key, (), 0, static.num_looks**2), static, params)
+
+    return policy
+
+
+def static(static: StaticParams, params: Params) -> Policy:
+    """One look drawn uniformly at the start and kept (paper)."""
+
+    def policy(key: jax.Array, state: "EnvState") -> jax.Array:
+        del state
+        return to_action(jax.random.randint(key, (), 0, static.num_looks**2), static, params)
+
+    return policy
+
+
+def coverage(static: StaticParams, params: Params) -> Policy:
+    """Scans line by line: azimuth first, back and forth, elevation rising (paper)."""
+
+    def policy(key: jax.Array, state: "EnvState") -> jax.Array:
+        del key
+        line, place = jnp.divmod(state.time, static.num_looks)
+        azimuth = jnp.where(line % 2 == 0, place, static.num_looks - 1 - place)
+        index = azimuth * static.num_looks + line % static.num_looks
+        return to_action(index, static, params)
+
+    return policy
+
+
+def stalest(static: StaticParams, params: Params) -> Policy:
+    """The look whose beam has the largest mean scan value."""
+    weights = beam_weights(static, params)
+
+    def policy(key: jax.Array, state: "EnvState") -> jax.Array:
+        del key
+        return to_action(jnp.argmax(weights @ state.scan_map.ravel()), static, params)
+
+    return policy
+
+
+def scheduler(static: StaticParams, params: Params) -> Policy:
+    """Revisits the most uncertain track once it is urgent, else looks at the stalest cell."""
+    weights = beam_weights(static, params)
+
+    def policy(key: jax.Array, state: "EnvState") -> jax.Array:
+        del key
+        share = trace_share(state.tracks, params)
+        worst = jnp.argmax(share)
+        towards_track = nearest_look(state.tracks.mean[worst], static, params)
+        stalest_look = jnp.argmax(weights @ state.scan_map.ravel())
+        index = jnp.where(share[worst] > REVISIT_SHARE, towards_track, stalest_look)
+        return to_action(index, static, params)
+
+    return policy
+
+
+def index(static: StaticParams, params: Params) -> Policy:
+    """The look with the largest index: mean scan value in its beam, plus the sum over the tracks in it
+    of trace / deletion threshold.
+    """
+    weights = beam_weights(static, params)
+    looks = look_grid(static, params)
+
+    def policy(key: jax.Array, state: "EnvState") -> jax.Array:
+        del key
+        inside = tracks_in_beams(state.tracks, looks, params)
+        value = weights @ state.scan_map.ravel() + inside @ trace_share(state.tracks, params)
+        return to_action(jnp.argmax(value), static, params)
+
+    return policy
+
+
+POLICIES: dict[str, Callable[[StaticParams, Params], Policy]] = {
+    "random": random,
+    "static": static,
+    "coverage": coverage,
+    "stalest": stalest,
+    "scheduler": scheduler,
+    "index": index,
+}
+
+
+def to_action(index: jax.Array, static: StaticParams, params: Params) -> jax.Array:
+    """Action `[2]` of look `index`: two indices, or two angles (rad) where actions are continuous."""
+    if static.continuous_actions:
+        return look_grid(static, params)[index]
+    return jnp.stack([index // static.num_looks, index % static.num_looks])
+
+
+def nearest_look(mean: jax.Array, static: StaticParams, params: Params) -> jax.Array:
+    """Index of the discrete look nearest in angle to a track's mean `[6]`."""
+    elevation, azimuth, _ = elevation_bearing_range(mean)
+    last = static.num_looks - 1
+    cells = jnp.round((jnp.stack([azimuth, elevation]) / params.field_limit + 1) / 2 * last)
+    azimuth_index, elevation_index = jnp.clip(cells, 0, last).astype(int)
+    return azimuth_index * static.num_looks + elevation_index
+
+
+def trace_share(tracks: Tracks, params: Params) -> jax.Array:
+    """Covariance trace over the deletion threshold `[T]`; 0 where there is no track."""
+    trace = jnp.trace(tracks.covariance, axis1=-2, axis2=-1)
+    return jnp.where(tracks.active, trace / params.deletion_threshold, 0.0)
+
+
+def tracks_in_beams(tracks: Tracks, looks: jax.Array, params: Params) -> jax.Array:
+    """`[L * L, T]` 1 where a live track's mean lies in the beam of a look, else 0."""
+    inside = jax.vmap(in_beam, in_axes=(None, 0, None))(position(tracks.mean), looks, params)
+    return jnp.where(tracks.active, inside, False).astype(tracks.mean.dtype)
