@@ -1,0 +1,135 @@
+"""Shapes and numbers: what is refused, and how the message names it."""
+
+import dataclasses
+import math
+import re
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxtrack import Params, StaticParams, validate
+from jaxtrack.params import REWARDS, check_trajectories, looks_per_axis
+
+QUANTITIES = [field for field in dataclasses.fields(Params) if "low" in field.metadata]
+
+
+def quantity(name):
+    return next(field for field in QUANTITIES if field.name == name)
+
+
+def test_looks_per_axis_of_the_paper():
+    assert looks_per_axis(math.radians(120), math.radians(9)) == 19
+    assert StaticParams().num_looks == 19
+
+
+def test_looks_per_axis_is_not_rounded_up_by_the_last_bit():
+    spacing = 0.3 * math.sqrt(2) / 2
+    assert looks_per_axis(spacing * 7, 0.3) == 7
+    assert looks_per_axis(spacing * 7.01, 0.3) == 8
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("num_truths", 0),
+        ("max_tracks", -1),
+        ("max_detections", 2.0),
+        ("max_clutter", -1),
+        ("map_size", 1),
+        ("num_looks", 1),
+        ("max_tracks", True),
+        ("num_truths", "3"),
+        ("reward", "unknown"),
+    ],
+)
+def test_shapes_that_make_no_sense_are_refused_by_name(name, value):
+    with pytest.raises(ValueError, match=rf"^{name} = {re.escape(repr(value))}: expected"):
+        StaticParams(**{name: value})
+
+
+def test_the_smallest_shapes_are_allowed():
+    StaticParams(num_truths=1, max_tracks=1, max_detections=1, max_clutter=0, map_size=2, num_looks=2)
+
+
+def test_shapes_are_hashable_and_compare_by_value():
+    assert hash(StaticParams(max_tracks=7)) == hash(StaticParams(max_tracks=7))
+    assert StaticParams(max_tracks=7) != StaticParams(max_tracks=8)
+
+
+@pytest.mark.parametrize("reward", REWARDS)
+def test_every_reward_is_a_choice(reward):
+    assert StaticParams(reward=reward).reward == reward
+
+
+def test_the_default_numbers_are_valid():
+    validate(StaticParams(), Params())
+
+
+@pytest.mark.parametrize("field", QUANTITIES, ids=lambda field: field.name)
+@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf, "many"])
+def test_what_is_no_finite_number_is_refused_by_name(field, bad):
+    with pytest.raises(ValueError, match=rf"^{field.name} = .*expected a number in"):
+        validate(StaticParams(), Params(**{field.name: bad}))
+
+
+@pytest.mark.parametrize("field", QUANTITIES, ids=lambda field: field.name)
+def test_the_lower_end_of_each_range_is_open_or_closed_as_stated(field):
+    low = field.metadata["low"]
+    below = np.nextafter(low, -math.inf)
+    refused, expected = (low, "\\(") if field.metadata["open_low"] else (below, "\\[")
+    with pytest.raises(ValueError, match=rf"^{field.name} = .*{expected}{low:g}, "):
+        validate(StaticParams(), Params(**{field.name: refused}))
+    if not field.metadata["open_low"]:
+        validate(StaticParams(), Params(**{field.name: low}))
+
+
+@pytest.mark.parametrize("name", ["detection_probability", "field_limit", "beam_azimuth", "beam_elevation"])
+def test_the_upper_end_of_each_range_is_closed(name):
+    high = quantity(name).metadata["high"]
+    validate(StaticParams(), Params(**{name: high}))
+    with pytest.raises(ValueError, match=rf"^{name} = .*, {high:g}\]"):
+        validate(StaticParams(), Params(**{name: 1.001 * high}))
+
+
+def test_the_message_names_value_range_and_unit():
+    with pytest.raises(ValueError, match=r"^time_step = -0\.1: expected a number in \(0, inf\] s$"):
+        validate(StaticParams(), Params(time_step=-0.1))
+
+
+def test_arrays_meant_for_vmap_are_checked_entry_by_entry():
+    validate(StaticParams(), Params(time_step=jnp.array([0.005, 0.05])))
+    with pytest.raises(ValueError, match=r"^time_step = "):
+        validate(StaticParams(), Params(time_step=jnp.array([0.005, -0.05])))
+    with pytest.raises(ValueError, match=r"^detection_probability = "):
+        validate(StaticParams(), Params(detection_probability=jnp.array([0.5, 1.5])))
+
+
+def test_ranges_that_depend_on_each_other():
+    with pytest.raises(ValueError, match=r"^min_range = 2000.0: expected at most max_range = 1000.0"):
+        validate(StaticParams(), Params(min_range=2000.0, max_range=1000.0))
+    with pytest.raises(ValueError, match=r"^min_range"):
+        validate(StaticParams(), Params(min_range=np.array([1.0, 20_000.0])))
+    validate(StaticParams(), Params(min_range=1000.0, max_range=1000.0))
+    with pytest.raises(ValueError, match=r"^clutter_rate = 3.0: expected at most max_clutter = 2"):
+        validate(StaticParams(max_clutter=2), Params(clutter_rate=3.0))
+    validate(StaticParams(max_clutter=2), Params(clutter_rate=2.0))
+
+
+@pytest.mark.parametrize("shape", [(4, 3, 5), (4, 2, 6), (3, 6), (0, 3, 6), (6,)])
+def test_trajectories_of_a_wrong_shape_are_refused(shape):
+    params = Params(trajectories=jnp.zeros(shape))
+    for check in (validate, check_trajectories):
+        with pytest.raises(ValueError, match=r"^trajectories has shape .*num_truths = 3, 6\]"):
+            check(StaticParams(num_truths=3), params)
+
+
+def test_trajectories_may_carry_a_batch_axis():
+    validate(StaticParams(num_truths=3), Params(trajectories=jnp.zeros((8, 4, 3, 6))))
+
+
+def test_the_numbers_are_traced_leaves():
+    assert len(jax.tree.leaves(Params())) == len(QUANTITIES)
+    doubled = jax.tree.map(lambda number: 2 * number, Params())
+    assert doubled.time_step == 2 * Params().time_step
