@@ -1,0 +1,141 @@
+"""Stone Soup's components, built from the parameters of jaxtrack."""
+
+import datetime
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from stonesoup.dataassociator.neighbour import NearestNeighbour
+from stonesoup.deleter.error import CovarianceBasedDeleter
+from stonesoup.gater.distance import DistanceGater
+from stonesoup.hypothesiser.distance import DistanceHypothesiser
+from stonesoup.initiator.simple import SimpleMeasurementInitiator
+from stonesoup.measures import Mahalanobis
+from stonesoup.models.measurement.nonlinear import CartesianToElevationBearingRange
+from stonesoup.models.transition.linear import CombinedLinearGaussianTransitionModel, ConstantVelocity
+from stonesoup.predictor.kalman import KalmanPredictor
+from stonesoup.tracker.simple import MultiTargetTracker
+from stonesoup.types.state import GaussianState, State
+from stonesoup.updater.kalman import UnscentedKalmanUpdater
+
+from jaxtrack.params import Params
+from jaxtrack.types import POSITION, STATE_DIM, VELOCITY
+
+EPOCH = datetime.datetime(2000, 1, 1)
+"""Time of step 0."""
+
+
+class ExactCartesianToElevationBearingRange(CartesianToElevationBearingRange):
+    """The stock model, but for its Jacobian: exact instead of finite differences.
+
+    Stone Soup's `SimpleMeasurementInitiator` is the only component that asks for it.
+    """
+
+    def jacobian(self, state: State, **kwargs: Any) -> np.ndarray:
+        """Derivative `[3, ndim_state]` of (elevation, bearing, range) by the state."""
+        offset = np.asarray(state.state_vector[self.mapping, :] - self.translation_offset, dtype=float)
+        x, y, z = (self.rotation_matrix @ offset)[:, 0]
+        ground_squared = x**2 + y**2
+        ground, r = np.sqrt(ground_squared), np.sqrt(ground_squared + z**2)
+        by_position = np.array(
+            [
+                [-x * z / (ground * r**2), -y * z / (ground * r**2), ground / r**2],
+                [-y / ground_squared, x / ground_squared, 0.0],
+                [x / r, y / r, z / r],
+            ]
+        )
+        jacobian = np.zeros((self.ndim_meas, self.ndim_state))
+        jacobian[:, list(self.mapping)] = by_position @ self.rotation_matrix
+        return jacobian
+
+
+@dataclass(frozen=True)
+class Components:
+    """The parts of one tracker, each a stock Stone Soup object."""
+
+    measurement_model: CartesianToElevationBearingRange
+    predictor: KalmanPredictor
+    updater: UnscentedKalmanUpdater
+    measure: Mahalanobis
+    hypothesiser: DistanceGater
+    associator: NearestNeighbour
+    initiator: SimpleMeasurementInitiator
+    deleter: CovarianceBasedDeleter
+
+    def tracker(self) -> MultiTargetTracker:
+        """The stock tracker; drive it with `update_tracker`."""
+        return MultiTargetTracker(
+            initiator=self.initiator,
+            deleter=self.deleter,
+            detector=None,
+            data_associator=self.associator,
+            updater=self.updater,
+        )
+
+
+def build_components(params: Params, exact_jacobian: bool = True) -> Components:
+    """Builds every component.
+
+    Args:
+        params: numbers of the tracker.
+        exact_jacobian: whether initiation uses the exact Jacobian, or the stock finite
+            differences, whose covariance is only good to about 1e-4.
+    """
+    model = measurement_model(params, exact_jacobian)
+    predictor = KalmanPredictor(transition_model(params.process_noise))
+    updater = UnscentedKalmanUpdater(
+        measurement_model=None, alpha=params.alpha, beta=params.beta, kappa=params.kappa
+    )
+    measure = Mahalanobis()
+    hypothesiser = DistanceGater(
+        DistanceHypothesiser(predictor, updater, measure, missed_distance=params.missed_distance),
+        measure,
+        params.gate_threshold,
+    )
+    return Components(
+        measurement_model=model,
+        predictor=predictor,
+        updater=updater,
+        measure=measure,
+        hypothesiser=hypothesiser,
+        associator=NearestNeighbour(hypothesiser),
+        initiator=SimpleMeasurementInitiator(prior_state(params), model),
+        deleter=CovarianceBasedDeleter(covar_trace_thresh=params.deletion_threshold),
+    )
+
+
+def transition_model(
+    process_noise: float, seeds: tuple[int | None, ...] = (None, None, None)
+) -> CombinedLinearGaussianTransitionModel:
+    """Constant velocity in three dimensions; `seeds` are for drawing process noise."""
+    return CombinedLinearGaussianTransitionModel(
+        [ConstantVelocity(float(process_noise), seed=seed) for seed in seeds]
+    )
+
+
+def measurement_model(params: Params, exact_jacobian: bool = True) -> CartesianToElevationBearingRange:
+    """Elevation, bearing and range seen from the origin."""
+    kind = ExactCartesianToElevationBearingRange if exact_jacobian else CartesianToElevationBearingRange
+    return kind(ndim_state=STATE_DIM, mapping=POSITION, noise_covar=noise_covariance(params))
+
+
+def noise_covariance(params: Params) -> np.ndarray:
+    """Measurement noise covariance R `[3, 3]` (rad^2, rad^2, m^2)."""
+    return np.diag([params.elevation_sigma, params.bearing_sigma, params.range_sigma]) ** 2
+
+
+def prior_state(params: Params) -> GaussianState:
+    """Prior of a new track: only its velocity entries are ever used."""
+    variance = np.zeros(STATE_DIM)
+    variance[list(VELOCITY)] = params.prior_velocity_sigma**2
+    return GaussianState(np.zeros((STATE_DIM, 1)), np.diag(variance))
+
+
+def step_duration(params: Params) -> datetime.timedelta:
+    """Time step as Stone Soup keeps it: whole microseconds."""
+    return datetime.timedelta(microseconds=round(params.time_step * 1e6))
+
+
+def time_of(step: int, params: Params) -> datetime.datetime:
+    """Time of a step."""
+    return EPOCH + step * step_duration(params)

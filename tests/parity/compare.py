@@ -1,0 +1,76 @@
+"""How far two results are apart, and how far they may be.
+
+Every error is measured in standard deviations of the quantity itself: a mean against its own
+standard deviation, a covariance entry against the two it belongs to. Metres, metres per
+second and radians then weigh alike, and nothing small hides behind something large. Against
+the size of the quantity (a position of 5 km known to 5 m) this is a thousand times stricter.
+"""
+
+import numpy as np
+
+TOLERANCE = 1e-9
+"""Largest error allowed in float64 with the exact Jacobian."""
+
+
+def mean_error(ours, theirs, covariance, angles=()):
+    """Largest |a - b| / sigma of `[..., n]`; differences at `angles` are taken modulo 2 pi."""
+    sigma = np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1))
+    difference = np.asarray(ours) - np.asarray(theirs)
+    for index in angles:
+        difference[..., index] = (difference[..., index] + np.pi) % (2 * np.pi) - np.pi
+    return _largest(np.abs(difference) / sigma)
+
+
+def covariance_error(ours, theirs):
+    """Largest |A_ij - B_ij| / (sigma_i sigma_j) of `[..., n, n]`."""
+    sigma = np.sqrt(np.diagonal(theirs, axis1=-2, axis2=-1))
+    return cross_covariance_error(ours, theirs, sigma, sigma)
+
+
+def cross_covariance_error(ours, theirs, sigma_rows, sigma_columns):
+    """Largest |A_ij - B_ij| / (sigma_i sigma_j) of `[..., n, m]`."""
+    scale = sigma_rows[..., :, None] * sigma_columns[..., None, :]
+    return _largest(np.abs(np.asarray(ours) - np.asarray(theirs)) / scale)
+
+
+def distance_error(ours, theirs):
+    """Largest |a - b| / max(1, b) where Stone Soup computed a distance."""
+    theirs = np.asarray(theirs)
+    known = ~np.isnan(theirs)
+    return _largest(np.abs(np.asarray(ours) - theirs)[known] / np.maximum(1.0, theirs[known]))
+
+
+def expected_error(info, slot, expected):
+    """Largest error of all that is predicted for one track: `TrackerInfo` against `Expected`."""
+    S = expected.detection_covariance
+    sigma = np.sqrt(np.diag(expected.covariance))
+    return _largest(
+        [
+            mean_error(info.predicted.mean[slot], expected.mean, expected.covariance),
+            covariance_error(info.predicted.covariance[slot], expected.covariance),
+            mean_error(info.expected.mean[slot], expected.detection_mean, S, angles=(1,)),
+            covariance_error(info.expected.covariance[slot], S),
+            cross_covariance_error(
+                info.expected.cross_covariance[slot],
+                expected.cross_covariance,
+                sigma,
+                np.sqrt(np.diag(S)),
+            ),
+            distance_error(info.distances[slot], expected.distances),
+        ],
+    )
+
+
+def estimate_error(tracks, slot, estimate):
+    """Largest error of mean and covariance of one track: `Tracks` against `Estimate`."""
+    return _largest(
+        [
+            mean_error(tracks.mean[slot], estimate.mean, estimate.covariance),
+            covariance_error(tracks.covariance[slot], estimate.covariance),
+        ],
+    )
+
+
+def _largest(errors):
+    # NaN must fail a comparison with the tolerance, and does; nothing to compare is no error.
+    return float(np.max(errors, initial=0.0))

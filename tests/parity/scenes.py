@@ -1,0 +1,83 @@
+"""Random track lists and detections around a direction: the material of single-step tests."""
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxtrack import NO_DETECTION, Detections, Params, Tracks
+from reference.components import measurement_model, transition_model
+
+AHEAD, BEHIND, UP = (0.3, 0.2), (np.pi, 0.1), (0.5, 1.45)
+"""Directions (azimuth, elevation): the plain one, bearing wrap, elevation fold."""
+
+
+def unit_vectors(azimuth, elevation):
+    return np.stack(
+        [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)],
+        axis=-1,
+    )
+
+
+def random_means(rng, count, towards, spread=0.05, distance=(1500.0, 6000.0)):
+    """States `[count, 6]` around a direction (azimuth, elevation in rad)."""
+    angles = np.array(towards) + spread * rng.standard_normal((count, 2))
+    mean = np.zeros((count, 6))
+    mean[:, 0::2] = rng.uniform(*distance, (count, 1)) * unit_vectors(angles[:, 0], angles[:, 1])
+    mean[:, 1::2] = 30.0 * rng.standard_normal((count, 3))
+    return mean
+
+
+def random_covariances(rng, count):
+    """Positive definite `[count, 6, 6]` with correlations, sigmas of 2-15 m and 1-25 m/s."""
+    factor = rng.standard_normal((count, 6, 8))
+    covariance = factor @ factor.transpose(0, 2, 1)
+    sigma = np.where(np.arange(6) % 2 == 0, rng.uniform(2, 15, (count, 6)), rng.uniform(1, 25, (count, 6)))
+    scale = sigma / np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
+    covariance = covariance * scale[:, :, None] * scale[:, None, :]
+    return (covariance + covariance.transpose(0, 2, 1)) / 2
+
+
+def track_list(mean, covariance, max_tracks=None):
+    """Track list with one track per row, born on step 0 from detections 0, 1, ..."""
+    count = len(mean)
+    padding = (max_tracks or count) - count
+    active = np.arange(count + padding) < count
+    return Tracks(
+        mean=jnp.asarray(np.pad(mean, ((0, padding), (0, 0)))),
+        covariance=jnp.asarray(np.pad(covariance, ((0, padding), (0, 0), (0, 0)))),
+        active=jnp.asarray(active),
+        updated_by=jnp.full(count + padding, NO_DETECTION),
+        birth_step=jnp.where(active, 0, NO_DETECTION),
+        birth_detection=jnp.where(active, jnp.arange(count + padding), NO_DETECTION),
+        age=jnp.zeros(count + padding, dtype=int),
+    )
+
+
+def random_tracks(rng, count, towards=AHEAD, max_tracks=None, spread=0.05):
+    return track_list(random_means(rng, count, towards, spread), random_covariances(rng, count), max_tracks)
+
+
+def detections_near(rng, tracks, params, count, sigmas=1.5):
+    """Detections `[count, 3]` of randomly chosen live tracks, so that some are contested."""
+    live = np.flatnonzero(np.asarray(tracks.active))
+    chosen = rng.choice(live, count)
+    mean, covariance = np.asarray(tracks.mean)[chosen], np.asarray(tracks.covariance)[chosen]
+    shaken = np.linalg.cholesky(covariance) @ rng.standard_normal((count, 6, 1)) * sigmas
+    points = (mean + shaken[..., 0])[:, 0::2]
+    distance = np.linalg.norm(points, axis=1)
+    value = np.stack(
+        [np.arcsin(points[:, 2] / distance), np.arctan2(points[:, 1], points[:, 0]), distance], axis=1
+    )
+    noise = np.sqrt(np.diag(measurement_model(params).noise_covar))
+    return value + noise * rng.standard_normal((count, 3))
+
+
+def padded(value, capacity):
+    """Detections of `value` `[D, 3]` with empty rows up to `capacity`."""
+    rows = len(value)
+    full = np.zeros((capacity, 3))
+    full[:rows] = value
+    return Detections.from_values(jnp.asarray(full), jnp.arange(capacity) < rows)
+
+
+def transition(params: Params):
+    return transition_model(params.process_noise)
