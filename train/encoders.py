@@ -1,0 +1,143 @@
+"""Track-list encoders of the paper: flatten, BiGRU, and self-attention before a BiGRU.
+
+Each maps a padded track list `[B, T, F]` and its mask `[B, T]` to a latent z_TL `[B, 64]`
+(paper, section Network Design). Rows outside the mask may hold anything, NaN included: they
+become zeros before any arithmetic, so that neither values nor gradients depend on them.
+"""
+
+import jax
+import jax.numpy as jnp
+from flax import linen as nn
+
+from train.vision import GAIN
+
+Dtype = jnp.dtype
+
+
+class FlattenEncoder(nn.Module):
+    """The zero-padded track list as one vector through one dense layer."""
+
+    features: int = 64
+
+    @nn.compact
+    def __call__(self, tracks: jax.Array, mask: jax.Array) -> jax.Array:
+        """Maps tracks `[B, T, F]` and mask `[B, T]` to a latent `[B, features]`."""
+        flat = zero_padding(tracks, mask).reshape(tracks.shape[0], -1)
+        return nn.relu(_dense(self.features)(flat))
+
+
+class BiGRUEncoder(nn.Module):
+    """Bidirectional GRU over the track list; its two final states through one dense layer."""
+
+    hidden: int = 64
+    features: int = 64
+
+    @nn.compact
+    def __call__(self, tracks: jax.Array, mask: jax.Array) -> jax.Array:
+        """Maps tracks `[B, T, F]` and mask `[B, T]` to a latent `[B, features]`."""
+        tracks = zero_padding(tracks, mask)
+        forward = GRU(self.hidden, name="forward")(tracks, mask)
+        backward = GRU(self.hidden, reverse=True, name="backward")(tracks, mask)
+        return nn.relu(_dense(self.features)(jnp.concatenate([forward, backward], axis=-1)))
+
+
+class AttentionEncoder(nn.Module):
+    """Multi-head self-attention over the tracks, then a BiGRU of half the stand-alone size."""
+
+    embedding: int = 64
+    heads: int = 4
+    hidden: int = 32
+    features: int = 64
+
+    @nn.compact
+    def __call__(self, tracks: jax.Array, mask: jax.Array) -> jax.Array:
+        """Maps tracks `[B, T, F]` and mask `[B, T]` to a latent `[B, features]`."""
+        x = _dense(self.embedding)(zero_padding(tracks, mask))
+        x = nn.LayerNorm()(x + SelfAttention(self.heads)(x, mask))
+        return BiGRUEncoder(self.hidden, self.features)(x, mask)
+
+
+class SelfAttention(nn.Module):
+    """Scaled dot-product attention of rows to the rows inside the mask (Vaswani et al. 2017)."""
+
+    heads: int
+
+    @nn.compact
+    def __call__(self, x: jax.Array, mask: jax.Array) -> jax.Array:
+        """Maps rows `[B, T, E]` and mask `[B, T]` to `[B, T, E]`; `heads` must divide E."""
+        batch, length, embedding = x.shape
+        qkv = nn.Dense(3 * embedding, kernel_init=nn.initializers.xavier_uniform(), name="qkv")(x)
+        query, key, value = jnp.moveaxis(qkv.reshape(batch, length, 3, self.heads, -1), 2, 0)
+        scores = jnp.einsum("bqhd,bkhd->bhqk", query, key) / query.shape[-1] ** 0.5
+        # A finite floor, not -inf: an empty track list would make the whole row NaN.
+        scores = jnp.where(mask[:, None, None, :], scores, jnp.finfo(scores.dtype).min)
+        mixed = jnp.einsum("bhqk,bkhd->bqhd", nn.softmax(scores), value)
+        return _dense(embedding, gain=1.0, name="out")(mixed.reshape(batch, length, embedding))
+
+
+class GRU(nn.Module):
+    """Final state of a gated recurrent unit that passes over rows outside the mask.
+
+    Formulas and bias placement of PyTorch's `GRU` and flax's `GRUCell`:
+    ``r, z = sigmoid(W_r x + U_r h), sigmoid(W_z x + U_z h)``,
+    ``n = tanh(W_n x + r (U_n h + c))``, ``h' = (1 - z) n + z h``.
+    """
+
+    hidden: int
+    reverse: bool = False
+    """Reads the list from its last row to its first."""
+
+    @nn.compact
+    def __call__(self, x: jax.Array, mask: jax.Array) -> jax.Array:
+        """Maps rows `[B, T, F]` and mask `[B, T]` to the final state `[B, hidden]`; 0 if empty."""
+        # All time steps at once: one large product instead of T small ones in the scan.
+        inputs = nn.Dense(3 * self.hidden, kernel_init=_per_gate(nn.initializers.xavier_uniform()))(x)
+        shape = (self.hidden, 3 * self.hidden)
+        kernel = self.param("recurrent_kernel", _per_gate(nn.initializers.orthogonal()), shape)
+        bias = self.param("recurrent_bias", nn.initializers.zeros, (self.hidden,))
+
+        def step(state: jax.Array, row: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, None]:
+            inputs, inside = row
+            updated = gru_update(state, inputs, kernel, bias)
+            return jnp.where(inside[:, None], updated, state), None
+
+        state = jnp.zeros((x.shape[0], self.hidden), inputs.dtype)
+        rows = (jnp.swapaxes(inputs, 0, 1), mask.T)
+        return jax.lax.scan(step, state, rows, reverse=self.reverse)[0]
+
+
+def gru_update(state: jax.Array, inputs: jax.Array, kernel: jax.Array, bias: jax.Array) -> jax.Array:
+    """Next state of a GRU.
+
+    Args:
+        state: `[B, H]`.
+        inputs: `[B, 3 H]` input projections with their biases, gates in the order r, z, n.
+        kernel: `[H, 3 H]` recurrent weights, gates in the same order.
+        bias: `[H]` of the recurrent part of n.
+    """
+    input_r, input_z, input_n = jnp.split(inputs, 3, axis=-1)
+    state_r, state_z, state_n = jnp.split(state @ kernel, 3, axis=-1)
+    reset = nn.sigmoid(input_r + state_r)
+    keep = nn.sigmoid(input_z + state_z)
+    candidate = jnp.tanh(input_n + reset * (state_n + bias[None, :]))
+    return (1 - keep) * candidate + keep * state
+
+
+def zero_padding(tracks: jax.Array, mask: jax.Array) -> jax.Array:
+    """Track list `[B, T, F]` with exact zeros in the rows outside the mask `[B, T]`."""
+    return jnp.where(mask[..., None], tracks, 0.0)
+
+
+def _dense(features: int, gain: float = GAIN, name: str | None = None) -> nn.Dense:
+    return nn.Dense(features, kernel_init=nn.initializers.orthogonal(gain), name=name)
+
+
+def _per_gate(initialise: nn.initializers.Initializer) -> nn.initializers.Initializer:
+    """Draws the three gates' kernels one by one, as fan-out and orthogonality are per gate."""
+
+    def init(key: jax.Array, shape: tuple[int, int], dtype: Dtype = jnp.float32) -> jax.Array:
+        fan_in, fan_out = shape[0], shape[1] // 3
+        gates = [initialise(gate_key, (fan_in, fan_out), dtype) for gate_key in jax.random.split(key, 3)]
+        return jnp.concatenate(gates, axis=-1)
+
+    return init

@@ -1,0 +1,76 @@
+"""The paper's actor-critic: NatureCNN and a track-list encoder, then separate MLPs.
+
+A network here is any object with ``init(key, observation)`` and ``apply(variables,
+observation) -> (logits, value)``, beside the distribution that its logits belong to.
+"""
+
+import jax
+import jax.numpy as jnp
+from flax import linen as nn
+
+from jaxtrack.observation import Observation
+from train.encoders import AttentionEncoder, BiGRUEncoder, FlattenEncoder
+from train.vision import GAIN, NatureCNN
+
+ENCODERS: dict[str, type[nn.Module]] = {
+    "flatten": FlattenEncoder,
+    "bigru": BiGRUEncoder,
+    "mhsa": AttentionEncoder,
+}
+"""Track-list encoders by the name used on the command line."""
+
+
+class PaperNetwork(nn.Module):
+    """Shared features, then an MLP 2 x 128 for the policy and another for the value.
+
+    The paper trains with Stable Baselines3's `MultiInputPolicy`, so this has its structure:
+    one feature extractor for both, no layer shared after it, tanh (bounded, so that early
+    updates stay small), orthogonal initialisation with gain sqrt(2), 0.01 for the policy head
+    (the first policy is almost uniform) and 1 for the value head. Its logits belong to
+    `train.distributions.FACTORED`.
+    """
+
+    encoder: str = "mhsa"
+    """One of `ENCODERS`."""
+    num_looks: int = 19
+    """Looks L along each axis."""
+    width: int = 128
+    """Width of both hidden layers of both MLPs."""
+
+    @nn.compact
+    def __call__(self, observation: Observation) -> tuple[jax.Array, jax.Array]:
+        """Policy and value of a batch of observations.
+
+        Args:
+            observation: `tracks` `[B, T, F]`, `mask` `[B, T]`, `scan_map` `[B, M, M]`.
+
+        Returns:
+            Logits `[B, 2, L]` of azimuth and elevation index, and values `[B]`.
+
+        Raises:
+            ValueError: if `encoder` is not a name in `ENCODERS`.
+        """
+        if self.encoder not in ENCODERS:
+            raise ValueError(f"encoder = {self.encoder!r}: expected one of {', '.join(ENCODERS)}")
+        z_sh = NatureCNN(name="scan_map")(observation["scan_map"])
+        z_tl = ENCODERS[self.encoder](name="track_list")(observation["tracks"], observation["mask"])
+        z = jnp.concatenate([z_sh, z_tl], axis=-1)
+        logits = MLP((self.width, self.width), 2 * self.num_looks, 0.01, name="policy")(z)
+        value = MLP((self.width, self.width), 1, 1.0, name="value")(z)
+        return logits.reshape(-1, 2, self.num_looks), value[..., 0]
+
+
+class MLP(nn.Module):
+    """Dense layers with tanh between them and a linear output."""
+
+    widths: tuple[int, ...]
+    outputs: int
+    output_gain: float
+    """Gain of the orthogonal initialisation of the output layer."""
+
+    @nn.compact
+    def __call__(self, x: jax.Array) -> jax.Array:
+        """Maps `[B, F]` to `[B, outputs]`."""
+        for width in self.widths:
+            x = nn.tanh(nn.Dense(width, kernel_init=nn.initializers.orthogonal(GAIN))(x))
+        return nn.Dense(self.outputs, kernel_init=nn.initializers.orthogonal(self.output_gain))(x)
