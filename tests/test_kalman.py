@@ -1,0 +1,193 @@
+"""The filter against the textbook, written out in numpy, and its linear algebra against numpy's."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from jaxtrack import Detections, Params, kalman
+from jaxtrack.models import constant_velocity
+
+MEANS = np.array([[3000.0, 10, 900, -5, 1200, 3], [-2000, 0, 5, 40, -600, 9], [1500, -7, -1500, 1, 20, 4]])
+predict = jax.jit(kalman.predict)
+predict_detections = jax.jit(kalman.predict_detections)
+cholesky = jax.jit(kalman.cholesky)
+inverse_3x3 = jax.jit(kalman.inverse_3x3)
+
+
+def predict_and_update(tracks, detections, associated, params):
+    expected = kalman.predict_detections(tracks, params)
+    return expected, kalman.update(tracks, expected, detections, associated)
+
+
+filter_once = jax.jit(predict_and_update)
+
+
+def spd(seed, size, sigmas=1.0):
+    root = np.random.default_rng(seed).normal(size=(size, size))
+    return (root @ root.T + 0.1 * np.eye(size)) * sigmas * np.reshape(sigmas, (-1, 1))
+
+
+def textbook_measure(states):
+    x, y, z = np.moveaxis(np.asarray(states)[..., 0::2], -1, 0)
+    return np.stack([np.arctan2(z, np.hypot(x, y)), np.arctan2(y, x), np.sqrt(x**2 + y**2 + z**2)], -1)
+
+
+def textbook_unscented(mean, P, params):
+    """Unscented transform as in Wan and van der Merwe (2000), angles averaged on the circle."""
+    n = 6
+    lam = params.alpha**2 * (n + params.kappa) - n
+    root = np.linalg.cholesky((n + lam) * P)
+    points = np.vstack([mean, mean + root.T, mean - root.T])
+    w_mean = np.full(13, 1 / (2 * (n + lam)))
+    w_mean[0] = lam / (n + lam)
+    w_cov = w_mean.copy()
+    w_cov[0] += 1 - params.alpha**2 + params.beta
+    Z = textbook_measure(points)
+    z = np.append(np.angle(w_mean @ np.exp(1j * Z[:, :2])), w_mean @ Z[:, 2])
+    D = Z - z
+    D[:, :2] = np.angle(np.exp(1j * D[:, :2]))
+    R = np.diag([params.elevation_sigma, params.bearing_sigma, params.range_sigma]) ** 2
+    return z, (w_cov * D.T) @ D + R, (w_cov * (points - mean).T) @ D
+
+
+@given(st.integers(0, 10_000), st.sampled_from([1, 2, 3, 6]))
+def test_cholesky_equals_numpys(x64, seed, size):
+    matrix = spd(seed, size, 10.0 ** np.arange(size))
+    np.testing.assert_allclose(cholesky(matrix), np.linalg.cholesky(matrix), rtol=1e-9)
+
+
+def test_cholesky_reads_the_lower_triangle_only():
+    matrix = spd(0, 6)
+    lower_only = np.tril(matrix) + np.triu(np.full((6, 6), 7.0), 1)
+    np.testing.assert_array_equal(cholesky(lower_only), cholesky(matrix))
+
+
+def test_cholesky_of_an_indefinite_matrix_is_nan():
+    assert bool(jnp.any(jnp.isnan(cholesky(jnp.diag(jnp.array([1.0, -1.0, 1.0]))))))
+
+
+@given(st.integers(0, 10_000))
+def test_inverse_3x3_equals_numpys_in_any_units(x64, seed):
+    matrix = spd(seed, 3, np.array([1e-3, 1e-3, 10.0]))
+    np.testing.assert_allclose(inverse_3x3(matrix), np.linalg.inv(matrix), rtol=1e-8)
+
+
+def test_inverse_3x3_needs_no_symmetry(x64):
+    matrix = np.array([[1.0, 2, 3], [0, 1, 4], [5, 6, 0]])
+    np.testing.assert_allclose(inverse_3x3(matrix), [[-24, 18, 5], [20, -15, -4], [-5, 4, 1]], rtol=1e-12)
+
+
+def test_prediction_is_the_textbooks(tracks_at, x64):
+    params = Params(process_noise=2.0)
+    tracks = tracks_at(MEANS, 4, age=jnp.array([0, 4, 7, 0]), updated_by=jnp.array([1, -1, 0, -1]))
+    tracks = tracks.replace(covariance=tracks.covariance.at[0].set(spd(1, 6, 30.0)))
+    predicted = predict(tracks, 0.4, params)
+    F, Q = (np.asarray(matrix) for matrix in constant_velocity(0.4, 2.0))
+    for row in range(3):
+        np.testing.assert_allclose(predicted.mean[row], F @ MEANS[row], rtol=1e-14)
+        expected = F @ np.asarray(tracks.covariance[row]) @ F.T + Q
+        np.testing.assert_allclose(predicted.covariance[row], expected, rtol=1e-13)
+    np.testing.assert_array_equal(predicted.updated_by, [-1] * 4)
+    np.testing.assert_array_equal(predicted.age[:3], [1, 5, 8])
+    np.testing.assert_array_equal(predicted.active, tracks.active)
+
+
+def test_sigma_points_carry_mean_and_covariance(params, x64):
+    P = spd(2, 6, 5.0)
+    points = np.asarray(kalman.sigma_points(jnp.asarray(MEANS[0]), jnp.asarray(P), params))
+    _, weight = kalman.unscented_weights(params)
+    assert points.shape == (13, 6)
+    np.testing.assert_array_equal(points[0], MEANS[0])
+    np.testing.assert_allclose(points[1:].mean(axis=0), MEANS[0], rtol=1e-12)
+    offsets = points[1:] - MEANS[0]
+    np.testing.assert_allclose(weight * offsets.T @ offsets, P, rtol=1e-10)
+
+
+@pytest.mark.parametrize("numbers", [{}, {"alpha": 1.0, "beta": 0.5, "kappa": 1.0}])
+def test_expected_detections_are_the_textbooks_unscented_transform(numbers, tracks_at, x64):
+    params = Params(**numbers)
+    # Far enough from Gaussian that every weight matters.
+    tracks = tracks_at(MEANS, 3, position_sigma=150.0)
+    expected = predict_detections(tracks, params)
+    for row in range(3):
+        z, S, C = textbook_unscented(MEANS[row], np.asarray(tracks.covariance[row]), params)
+        np.testing.assert_allclose(expected.mean[row], z, rtol=1e-10)
+        np.testing.assert_allclose(expected.covariance[row], S, rtol=1e-8, atol=1e-10)
+        np.testing.assert_allclose(expected.cross_covariance[row], C, rtol=1e-8, atol=1e-8)
+
+
+def test_on_a_linear_measurement_the_unscented_filter_is_the_kalman_filter(monkeypatch, tracks_at, x64):
+    # Small angles, so that the folding of elevations and bearings does nothing.
+    H = np.array([[1e-6, 2e-7, 0, 0, 3e-6, 0], [0, 1e-7, -2e-6, 0, 0, 4e-7], [0.5, 0, 0.2, 1, 0, 0.1]])
+    monkeypatch.setattr(kalman, "elevation_bearing_range", lambda states: states @ H.T)
+    params = Params(elevation_sigma=1e-5, bearing_sigma=2e-5, range_sigma=3.0)
+    R = np.diag([1e-5, 2e-5, 3.0]) ** 2
+    P = spd(3, 6, 4.0)
+    tracks = tracks_at(MEANS, 3).replace(covariance=jnp.asarray(np.stack([P, 2 * P, 3 * P])))
+    value = MEANS @ H.T + np.array([1e-5, -2e-5, 4.0])
+    detections = Detections.from_values(value)
+    # A new function: the one above may be compiled already, for the radar's own measurement.
+    linear_filter = jax.jit(lambda *arguments: predict_and_update(*arguments))
+    expected, updated = linear_filter(tracks, detections, jnp.array([0, 1, 2]), params)
+    for row in range(3):
+        prior = (row + 1) * P
+        S = H @ prior @ H.T + R
+        K = prior @ H.T @ np.linalg.inv(S)
+        np.testing.assert_allclose(expected.mean[row], H @ MEANS[row], rtol=1e-10)
+        np.testing.assert_allclose(expected.covariance[row], S, rtol=1e-8, atol=1e-18)
+        mean = MEANS[row] + K @ (value[row] - H @ MEANS[row])
+        np.testing.assert_allclose(updated.mean[row], mean, rtol=1e-9)
+        posterior = (np.eye(6) - K @ H) @ prior
+        np.testing.assert_allclose(updated.covariance[row], posterior, rtol=1e-7, atol=1e-8)
+
+
+def test_tracks_without_a_detection_keep_their_prediction(tracks_at, params):
+    tracks = tracks_at(MEANS, 3)
+    detections = Detections.from_values(textbook_measure(MEANS[:2]))
+    _, updated = filter_once(tracks, detections, jnp.array([-1, 1, -1]), params)
+    np.testing.assert_array_equal(updated.updated_by, [-1, 1, -1])
+    for row in (0, 2):
+        np.testing.assert_array_equal(updated.mean[row], tracks.mean[row])
+        np.testing.assert_array_equal(updated.covariance[row], tracks.covariance[row])
+    assert float(jnp.trace(updated.covariance[1])) < float(jnp.trace(tracks.covariance[1]))
+
+
+def test_an_innovation_across_the_rear_is_small(tracks_at, params, x64):
+    # The track lies at bearing pi - 0.001, the detection at -pi + 0.001: 0.002 further left.
+    behind = [3000 * np.cos(np.pi - 0.001), 0, 3000 * np.sin(np.pi - 0.001), 0, 0, 0]
+    detections = Detections.from_values([[0.0, -np.pi + 0.001, 3000.0]])
+    expected, updated = filter_once(tracks_at(behind, 1), detections, jnp.array([0]), params)
+    np.testing.assert_allclose(expected.mean[0, 1], np.pi - 0.001, atol=1e-6)
+    # Both variances are (10 m / 3000 m)^2 and (2 mrad)^2: the gain is 0.735, the way 6 m.
+    gain = (1 / 300) ** 2 / ((1 / 300) ** 2 + 0.002**2)
+    np.testing.assert_allclose(updated.mean[0, 2], 3 - gain * 6, atol=1e-2)
+
+
+@given(seed=st.integers(0, 10_000), scale=st.sampled_from([1.0, 30.0, 300.0]))
+def test_updates_keep_covariances_symmetric_positive_and_smaller(tracks_at, params, x64, seed, scale):
+    tracks = tracks_at(MEANS, 3)
+    covariances = np.stack([spd(seed + row, 6, scale * np.ones(6)) for row in range(3)])
+    tracks = tracks.replace(covariance=jnp.asarray(covariances))
+    detections = Detections.from_values(textbook_measure(MEANS))
+    _, updated = filter_once(tracks, detections, jnp.arange(3), params)
+    P = np.asarray(updated.covariance)
+    np.testing.assert_allclose(P, P.swapaxes(-1, -2), atol=1e-10 * scale**2)
+    for row in range(3):
+        assert np.linalg.eigvalsh(P[row]).min() >= -1e-9 * np.trace(P[row])
+        shrinkage = covariances[row] - P[row]
+        assert np.linalg.eigvalsh(shrinkage).min() >= -1e-9 * np.trace(covariances[row])
+
+
+def test_single_precision_agrees_with_double(tracks_at, params, x64):
+    tracks = tracks_at(MEANS, 3, position_sigma=5.0)
+    detections = Detections.from_values(textbook_measure(MEANS) + np.array([1e-3, -1e-3, 4.0]))
+    single = jax.tree.map(
+        lambda leaf: leaf.astype(jnp.float32) if leaf.dtype == jnp.float64 else leaf, (tracks, detections)
+    )
+    _, double_result = filter_once(tracks, detections, jnp.arange(3), params)
+    _, single_result = filter_once(*single, jnp.arange(3), params)
+    np.testing.assert_allclose(single_result.mean, double_result.mean, atol=2e-2)
+    np.testing.assert_allclose(single_result.covariance, double_result.covariance, rtol=2e-2, atol=0.05)
