@@ -104,11 +104,11 @@ class SearchTrack(environment.Environment[EnvState, Params]):
         """New truths, no tracks, a field never seen."""
         check_trajectories(self.static, params)
         state = EnvState(
-            time=jnp.asarray(0),
+            time=jnp.asarray(0, dtype=int),
             truths=initiate_truths(key, self.static, params),
             tracks=Tracks.empty(self.static.max_tracks),
             scan_map=initial_scan_map(self.static),
-            num_initiated=jnp.asarray(0),
+            num_initiated=jnp.asarray(0, dtype=int),
         )
         return self.observe(key, state, None, params), state
 

@@ -61,7 +61,7 @@ class Detections:
         value = jnp.asarray(value, dtype=float)
         rows = value.shape[0]
         active = jnp.ones(rows, dtype=bool) if active is None else jnp.asarray(active)
-        return cls(value=value, active=active, truth=jnp.full(rows, NO_TRUTH))
+        return cls(value=value, active=active, truth=jnp.full(rows, NO_TRUTH, dtype=int))
 
 
 @struct.dataclass
@@ -96,9 +96,9 @@ class Tracks:
             mean=jnp.zeros((max_tracks, STATE_DIM)),
             covariance=jnp.zeros((max_tracks, STATE_DIM, STATE_DIM)),
             active=jnp.zeros(max_tracks, dtype=bool),
-            updated_by=jnp.full(max_tracks, NO_DETECTION),
-            birth_step=jnp.full(max_tracks, NEVER),
-            birth_detection=jnp.full(max_tracks, NO_DETECTION),
+            updated_by=jnp.full(max_tracks, NO_DETECTION, dtype=int),
+            birth_step=jnp.full(max_tracks, NEVER, dtype=int),
+            birth_detection=jnp.full(max_tracks, NO_DETECTION, dtype=int),
             age=jnp.zeros(max_tracks, dtype=int),
         )
 
