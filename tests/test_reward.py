@@ -1,0 +1,87 @@
+"""Reward terms by hand arithmetic."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxtrack import NO_DETECTION, Params, StaticParams, Tracks
+from jaxtrack.params import REWARDS
+from jaxtrack.reward import TRACK_TERMS, covariance_growth, covariance_reduction, information, reward_terms
+
+STATIC = StaticParams(num_truths=4)
+PARAMS = Params(deletion_threshold=1000.0)
+NONE = NO_DETECTION
+
+
+def track_list(norms, updated_by, ages=None, active=None):
+    """Tracks whose covariance has one entry, so that norm and trace are that number."""
+    count = len(norms)
+    return Tracks.empty(count).replace(
+        covariance=jnp.zeros((count, 6, 6)).at[:, 0, 0].set(jnp.asarray(norms, float)),
+        updated_by=jnp.array(updated_by),
+        age=jnp.array([5] * count if ages is None else ages),
+        active=jnp.array([True] * count if active is None else active),
+    )
+
+
+def reduction(before, after):
+    return float(covariance_reduction(before, after, STATIC, PARAMS))
+
+
+def test_only_tracks_detected_now_or_one_step_ago_count():
+    before = track_list([500, 400, 300, 200], [NONE, 0, 1, NONE])
+    after = track_list([100, 450, 50, 260], [0, NONE, 1, NONE])
+    # Now: 500 - 100. One step ago: 400 - 450. Both: 300 - 50. Neither: nothing.
+    np.testing.assert_allclose(reduction(before, after), (400 - 50 + 250) / 1000, rtol=1e-6)
+
+
+def test_births_and_deaths_are_worth_nothing():
+    # Slot 0 dies, though detected before; slot 1 is born in a slot never used.
+    before = track_list([900, 0], [0, NONE], active=[True, False])
+    after = track_list([950, 80], [NONE, 0], ages=[6, 0], active=[False, True])
+    assert reduction(before, after) == 0.0
+
+
+def test_a_track_born_in_the_slot_of_one_just_deleted_is_worth_nothing():
+    before = track_list([900], [0], ages=[7])
+    after = track_list([80], [1], ages=[0])
+    assert reduction(before, after) == 0.0
+    # On the next step it is an ordinary track.
+    assert reduction(after, track_list([30], [NONE], ages=[1])) == pytest.approx(0.05)
+
+
+def test_the_norm_is_that_of_the_whole_matrix():
+    full = track_list([0], [0]).replace(covariance=jnp.full((1, 6, 6), 50.0))
+    assert reduction(full, track_list([100], [0])) == pytest.approx((300 - 100) / 1000)
+
+
+def test_as_printed_is_the_opposite_sign():
+    before, after = track_list([500], [NONE]), track_list([100], [0])
+    assert float(covariance_growth(before, after, STATIC, PARAMS)) == pytest.approx(-0.4)
+
+
+def test_information_pays_for_every_certain_live_track():
+    before = track_list([9, 9, 9, 9], [0, 0, 0, 0])
+    after = track_list([0, 250, 1500, 100], [NONE] * 4, active=[True, True, True, False])
+    # 1 + 0.75 + 0 for the lost one, over 4 truths; the empty slot counts nothing.
+    assert float(information(before, after, STATIC, PARAMS)) == pytest.approx(1.75 / 4)
+
+
+def test_information_uses_the_trace():
+    after = track_list([0], [0]).replace(covariance=jnp.full((1, 6, 6), 50.0))
+    assert float(information(after, after, STATIC, PARAMS)) == pytest.approx((1 - 0.3) / 4)
+
+
+@pytest.mark.parametrize(("name", "track"), [("paper", 0.4), ("as_printed", -0.4), ("information", 0.225)])
+def test_rewards_by_name_are_weighted_and_searching_costs_the_mean_scan_value(name, track):
+    static = StaticParams(num_truths=4, reward=name)
+    params = PARAMS.replace(track_weight=3.0, search_weight=0.5)
+    scan_map = jnp.array([[0.0, 1.0], [0.5, 0.1]])
+    before, after = track_list([500], [NONE]), track_list([100], [0])
+    track_term, search_term = reward_terms(before, after, scan_map, static, params)
+    assert float(track_term) == pytest.approx(3 * track)
+    assert float(search_term) == pytest.approx(-0.5 * 0.4)
+
+
+def test_every_name_of_a_reward_has_its_function():
+    assert set(TRACK_TERMS) == set(REWARDS)

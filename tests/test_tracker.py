@@ -1,0 +1,244 @@
+"""One cycle of the tracker: order of the verbs, symmetries, masks, gradients, transformations."""
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxtrack import NO_DETECTION, Detections, Params, Tracks, tracker
+from jaxtrack.models import inverse_elevation_bearing_range
+from jaxtrack.types import NO_TRUTH
+
+STEP = 7
+DT = 0.1
+# Detection 0 belongs to track 1, detection 1 to track 0; detection 2 is new; row 3 is empty.
+DETECTED = np.array([[0.1, 0.3, 2003.0], [-0.2, 0.0, 2995.0], [0.4, 0.8, 5000.0], [0.0, 0.0, 4000.0]])
+# Track 2 is lost and too uncertain; rows 3 and 4 are empty.
+TRACKED = np.array([[-0.2, 0.0, 3000.0], [0.1, 0.3, 2000.0], [0.0, -0.5, 4000.0]])
+step = jax.jit(tracker.step)
+
+
+@pytest.fixture
+def tracks(tracks_at):
+    means = np.zeros((3, 6))
+    means[:, 0::2] = inverse_elevation_bearing_range(jnp.asarray(TRACKED))
+    means[:, 1::2] = [[3, -2, 1], [0, 5, 0], [1, 1, 1]]
+    built = tracks_at(means, 5, birth_step=jnp.array([0, 1, 2, -1, -1]), age=jnp.array([6, 5, 4, 0, 0]))
+    return built.replace(
+        covariance=built.covariance.at[2].multiply(20.0), birth_detection=jnp.array([0, 1, 2, -1, -1])
+    )
+
+
+@pytest.fixture
+def detections():
+    return Detections.from_values(DETECTED, [True, True, True, False])
+
+
+def by_birth(tracks):
+    """Live tracks in the order of their identity, whatever their slots."""
+    rows = np.flatnonzero(tracks.active)
+    identity = sorted((int(tracks.birth_step[row]), int(tracks.birth_detection[row]), row) for row in rows)
+    order = np.array([row for *_, row in identity], dtype=int)
+    return jax.tree.map(lambda leaf: np.asarray(leaf)[order], tracks)
+
+
+def assert_close(actual, expected, rtol=2e-5, atol=2e-3):
+    jax.tree.map(lambda a, e: np.testing.assert_allclose(a, e, rtol=rtol, atol=atol), actual, expected)
+
+
+def pad(record, rows, fill):
+    """The record with `rows` more rows, all numbers of which are `fill`; the masks are False."""
+
+    def extend(leaf):
+        value = fill if jnp.issubdtype(leaf.dtype, jnp.floating) else 0
+        return jnp.concatenate([leaf, jnp.full((rows, *leaf.shape[1:]), value, leaf.dtype)])
+
+    return jax.tree.map(extend, record)
+
+
+def poison(record):
+    """The record with NaN in all numbers of its empty rows."""
+
+    def fill(leaf):
+        if not jnp.issubdtype(leaf.dtype, jnp.floating):
+            return leaf
+        return leaf.at[~record.active].set(jnp.nan)
+
+    return jax.tree.map(fill, record)
+
+
+def test_the_six_verbs_in_order(tracks, detections, params):
+    after, info = step(tracks, detections, DT, STEP, params)
+    np.testing.assert_array_equal(info.associated, [1, 0, NO_DETECTION, NO_DETECTION, NO_DETECTION])
+    np.testing.assert_array_equal(info.deleted, [False, False, True, False, False])
+    # The new track is born in the slot that became free on this very step.
+    np.testing.assert_array_equal(info.initiated, [False, False, True, False, False])
+    np.testing.assert_array_equal(after.active, [True, True, True, False, False])
+    np.testing.assert_array_equal(after.updated_by, [1, 0, 2, NO_DETECTION, NO_DETECTION])
+    np.testing.assert_array_equal(after.birth_step[:3], [0, 1, STEP])
+    np.testing.assert_array_equal(after.age[:3], [7, 6, 0])
+    np.testing.assert_allclose(info.predicted.mean[:2, 0], tracks.mean[:2, 0] + DT * tracks.mean[:2, 1])
+    np.testing.assert_allclose(after.mean[:2], info.updated.mean[:2])
+    np.testing.assert_allclose(after.mean[2, 4], 5000 * np.sin(0.4), rtol=1e-5)
+    assert int(info.num_dropped) == 0
+
+
+def test_an_empty_look_is_only_a_prediction(tracks, detections, params):
+    blind = detections.replace(active=jnp.zeros(4, dtype=bool))
+    after, info = step(tracks, blind, DT, STEP, params)
+    np.testing.assert_array_equal(after.active, [True, True, False, False, False])
+    np.testing.assert_array_equal(after.mean[:2], info.predicted.mean[:2])
+    np.testing.assert_array_equal(after.covariance[:2], info.predicted.covariance[:2])
+    np.testing.assert_array_equal(after.updated_by, [NO_DETECTION] * 5)
+
+
+def test_from_nothing_every_detection_becomes_a_track(detections, params):
+    after, _ = step(Tracks.empty(5), detections, DT, STEP, params)
+    np.testing.assert_array_equal(after.active, [True, True, True, False, False])
+    np.testing.assert_array_equal(after.birth_detection[:3], [0, 1, 2])
+
+
+def test_a_newborn_survives_its_first_step_however_uncertain(detections):
+    params = Params(deletion_threshold=100.0)  # three velocity variances alone are 2700
+    born, _ = step(Tracks.empty(5), detections, DT, STEP, params)
+    np.testing.assert_array_equal(born.active, [True, True, True, False, False])
+    blind = detections.replace(active=jnp.zeros(4, dtype=bool))
+    after, info = step(born, blind, DT, STEP + 1, params)
+    assert not bool(jnp.any(after.active))
+    np.testing.assert_array_equal(info.deleted, born.active)
+
+
+def test_the_detection_of_a_track_just_deleted_starts_no_other(tracks, detections):
+    after, info = step(tracks, detections, DT, STEP, Params(deletion_threshold=100.0))
+    np.testing.assert_array_equal(info.deleted, [True, True, True, False, False])
+    np.testing.assert_array_equal(after.birth_detection[after.active], [2])
+
+
+def test_a_full_track_list_counts_what_it_drops(tracks, detections, params):
+    certain = jnp.broadcast_to(100 * jnp.eye(6), (5, 6, 6))
+    elsewhere = jnp.zeros((2, 6)).at[:, 0].set(8000.0).at[:, 2].set(jnp.array([100.0, -100.0]))
+    full = tracks.replace(
+        covariance=certain, active=jnp.ones(5, dtype=bool), mean=tracks.mean.at[3:].set(elsewhere)
+    )
+    after, info = step(full, detections, DT, STEP, params)
+    assert int(info.num_dropped) == 1
+    np.testing.assert_array_equal(after.birth_step, full.birth_step)
+    jax.tree.map(np.testing.assert_array_equal, after, info.updated)
+
+
+def test_the_tracker_never_reads_which_truth_caused_a_detection(tracks, detections, params):
+    told = detections.replace(truth=jnp.array([2, 1, 0, NO_TRUTH]))
+    results = [step(tracks, each, DT, STEP, params) for each in (detections, told)]
+    jax.tree.map(np.testing.assert_array_equal, *results)
+
+
+def test_permuting_slots_permutes_the_result(tracks, detections, params):
+    order = jnp.array([4, 2, 1, 3, 0])
+    shuffled = jax.tree.map(lambda leaf: leaf[order], tracks)
+    after, _ = step(tracks, detections, DT, STEP, params)
+    after_shuffled, info = step(shuffled, detections, DT, STEP, params)
+    np.testing.assert_array_equal(info.associated, [-1, -1, 0, -1, 1])
+    np.testing.assert_array_equal(info.deleted, [False, True, False, False, False])
+    assert_close(by_birth(after_shuffled), by_birth(after))
+
+
+def test_permuting_detections_permutes_the_association(tracks, detections, params):
+    order = jnp.array([3, 1, 2, 0])
+    shuffled = jax.tree.map(lambda leaf: leaf[order], detections)
+    after, _ = step(tracks, detections, DT, STEP, params)
+    after_shuffled, info = step(tracks, shuffled, DT, STEP, params)
+    np.testing.assert_array_equal(info.associated[:3], [1, 3, NO_DETECTION])
+    np.testing.assert_array_equal(after_shuffled.active, after.active)
+    assert_close((after_shuffled.mean, after_shuffled.covariance), (after.mean, after.covariance))
+
+
+@pytest.mark.parametrize("fill", [0.0, np.nan])
+def test_more_empty_rows_change_nothing(fill, tracks, detections, params):
+    after, _ = step(tracks, detections, DT, STEP, params)
+    padded, info = step(pad(tracks, 2, fill), pad(detections, 2, fill), DT, STEP, params)
+    np.testing.assert_array_equal(info.initiated, [False, False, True, False, False, False, False])
+    assert_close(by_birth(padded), by_birth(after))
+
+
+def test_nan_in_empty_rows_changes_no_bit(tracks, detections, params):
+    clean = step(tracks, detections, DT, STEP, params)
+    poisoned = step(poison(tracks), poison(detections), DT, STEP, params)
+    jax.tree.map(np.testing.assert_array_equal, poisoned, clean)
+
+
+def loss(params, tracks, detections):
+    """A smooth function of everything the step returns about live tracks."""
+    after, _ = tracker.step(tracks, detections, params.time_step, STEP, params)
+    live = after.active.astype(after.mean.dtype)
+    return jnp.sum(live @ after.mean) + jnp.sum(live * jnp.trace(after.covariance, axis1=1, axis2=2))
+
+
+def floating(record):
+    """Only the leaves that can have a gradient."""
+    return [leaf for leaf in jax.tree.leaves(record) if jnp.issubdtype(leaf.dtype, jnp.floating)]
+
+
+loss_and_gradient = jax.jit(jax.value_and_grad(loss, argnums=(0, 1, 2), allow_int=True))
+
+
+def test_gradients_are_finite_and_blind_to_empty_rows(tracks, detections, x64):
+    params = jax.tree.map(lambda number: jnp.asarray(float(number)), Params(time_step=DT))
+    _, clean = loss_and_gradient(params, tracks, detections)
+    _, poisoned = loss_and_gradient(params, poison(tracks), poison(detections))
+    jax.tree.map(np.testing.assert_array_equal, floating(poisoned), floating(clean))
+    by_params, by_tracks, by_detections = clean
+    assert all(np.all(np.isfinite(leaf)) for leaf in floating(clean))
+    # Empty rows have no influence: neither rows 3 and 4 of the tracks nor row 3 of the detections.
+    assert not np.any(by_tracks.mean[3:])
+    assert not np.any(by_detections.value[3])
+    assert np.all(np.any(by_detections.value[:3] != 0, axis=-1))
+    for name in ("time_step", "range_sigma", "bearing_sigma", "process_noise", "prior_velocity_sigma"):
+        epsilon = 1e-4 * float(getattr(params, name))
+        low, high = (
+            loss_and_gradient(
+                params.replace(**{name: getattr(params, name) + sign * epsilon}), tracks, detections
+            )[0]
+            for sign in (-1, 1)
+        )
+        np.testing.assert_allclose(getattr(by_params, name), (high - low) / (2 * epsilon), rtol=1e-4)
+
+
+def test_the_second_step_is_not_compiled_again(params):
+    traced = jax.jit(chex.assert_max_traces(tracker.step, n=1))
+    tracks = Tracks.empty(2)
+    for index in range(3):
+        tracks, _ = traced(tracks, Detections.from_values(DETECTED[:1]), DT, index, params)
+    assert int(tracks.age[0]) == 2
+
+
+def test_compiled_equals_eager(tracks, detections, params):
+    compiled = step(tracks, detections, DT, STEP, params)
+    assert_close(compiled, tracker.step(tracks, detections, DT, STEP, params), rtol=1e-4, atol=1e-2)
+
+
+def test_a_batch_equals_a_loop(tracks, detections, params):
+    scenes = [
+        (tracks, detections),
+        (Tracks.empty(5), detections),
+        (tracks, detections.replace(active=jnp.zeros(4, dtype=bool))),
+    ]
+    batch = jax.tree.map(lambda *leaves: jnp.stack(leaves), *scenes)
+    batched, _ = jax.jit(jax.vmap(tracker.step, in_axes=(0, 0, None, None, None)))(*batch, DT, STEP, params)
+    for row, scene in enumerate(scenes):
+        alone, _ = step(*scene, DT, STEP, params)
+        assert_close(by_birth(jax.tree.map(lambda leaf, row=row: leaf[row], batched)), by_birth(alone))
+
+
+def test_the_precision_of_the_input_is_that_of_the_output(tracks, detections, params, x64):
+    narrow = jax.tree.map(
+        lambda leaf: leaf.astype(jnp.float32) if leaf.dtype == jnp.float64 else leaf, (tracks, detections)
+    )
+    after, _ = step(*narrow, DT, STEP, params)
+    wide = jax.tree.map(
+        lambda leaf: leaf.astype(jnp.float64) if leaf.dtype == jnp.float32 else leaf, (tracks, detections)
+    )
+    exact, _ = step(*wide, DT, STEP, params)
+    assert exact.mean.dtype == exact.covariance.dtype == jnp.float64
+    np.testing.assert_array_equal(after.updated_by, exact.updated_by)
+    np.testing.assert_allclose(after.mean[:3], exact.mean[:3], rtol=1e-5, atol=0.05)
