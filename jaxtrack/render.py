@@ -125,7 +125,8 @@ def _write_gif(pictures: Iterator["Image"], path: Path, fps: int) -> None:
     sample = Image.new("RGB", (width, 3 * height))
     for row, index in enumerate((0, len(frames) // 2, -1)):
         sample.paste(frames[index], (0, row * height))
-    palette = sample.quantize(COLOURS, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
+    # Two rounds of k-means keep greys free of tint.
+    palette = sample.quantize(COLOURS, Image.Quantize.MAXCOVERAGE, 2, dither=Image.Dither.NONE)
     indexed = [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
     durations = [round(1000 / fps)] * (len(frames) - 1) + [HOLD_LAST]
     indexed[0].save(path, save_all=True, append_images=indexed[1:], duration=durations, loop=0)
