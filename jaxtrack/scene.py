@@ -212,7 +212,7 @@ class Scene:
 
 
 class _Tracks:
-    """Tracks of one panel: a dot and an ellipse each, coloured by uncertainty."""
+    """Tracks of one panel: a dot and an ellipse each, coloured by trace / deletion threshold."""
 
     def __init__(self, axes: "Axes") -> None:
         from matplotlib.collections import PolyCollection

@@ -16,7 +16,7 @@ COLOUR = "#0b3c8c"
 
 CURVES = {
     "episode_return": "return of an episode",
-    "completeness": "completeness (share of truths tracked)",
+    "completeness": "completeness (truths tracked)",
     "covariance_norm_mean": "mean covariance norm (m\u00b2)",
 }
 """Columns of the metrics file that a learning curve shows, with their labels."""
@@ -104,8 +104,10 @@ def comparison(table: Mapping[str, Mapping[str, Interval]], out_png: str | Path)
 def _dots_and_intervals(axes: "Axes", intervals: list[Interval]) -> None:
     mean, low, high = np.array(intervals, dtype=float).T
     rows = np.arange(len(mean))
-    axes.hlines(rows, low, high, color=COLOUR, lw=2)
-    axes.plot(mean, rows, "o", color=COLOUR, ms=5)
+    axes.hlines(rows, low, high, color=COLOUR, lw=1.2)
+    # Bars at the ends keep an interval visible that is narrower than its dot; none is cut at zero.
+    axes.plot(mean, rows, "o", color=COLOUR, ms=3.5, clip_on=False)
+    axes.plot([low, high], [rows, rows], "|", color=COLOUR, ms=9, clip_on=False)
     axes.grid(axis="y", color="0.92")
     # From zero, so that lengths can be compared.
     axes.set_xlim(0, 1.06 * max(np.nanmax(high), np.finfo(float).tiny))
