@@ -104,13 +104,12 @@ def build_components(params: Params, exact_jacobian: bool = True) -> Components:
     )
 
 
-def transition_model(
-    process_noise: float, seeds: tuple[int | None, ...] = (None, None, None)
-) -> CombinedLinearGaussianTransitionModel:
-    """Constant velocity in three dimensions; `seeds` are for drawing process noise."""
-    return CombinedLinearGaussianTransitionModel(
-        [ConstantVelocity(float(process_noise), seed=seed) for seed in seeds]
-    )
+def transition_model(process_noise: float, seed: int | None = None) -> CombinedLinearGaussianTransitionModel:
+    """Constant velocity in three dimensions; `seed` is for drawing process noise.
+
+    It must be the combined model's: noise is drawn there, and the seeds of its parts are unused.
+    """
+    return CombinedLinearGaussianTransitionModel([ConstantVelocity(float(process_noise))] * 3, seed=seed)
 
 
 def measurement_model(params: Params, exact_jacobian: bool = True) -> CartesianToElevationBearingRange:

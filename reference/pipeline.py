@@ -5,9 +5,10 @@ from dataclasses import dataclass
 import numpy as np
 from stonesoup.types.detection import Detection
 from stonesoup.types.track import Track
+from stonesoup.types.update import Update
 
 from jaxtrack.params import Params
-from jaxtrack.types import Tracks
+from jaxtrack.types import NO_DETECTION, Tracks
 from reference.components import build_components, time_of
 from reference.translate import (
     TrackKey,
@@ -56,6 +57,7 @@ class StepRecord:
     """What the stock tracker did in one step; tracks go by their keys.
 
     Attributes:
+        step: number of the step.
         expected: intermediates of every track that was alive before the step, if asked for.
         associated: detection of each track that got one.
         updated: estimate of every track that was alive before, after the update.
@@ -64,12 +66,18 @@ class StepRecord:
         live: estimate of every track alive after the step.
     """
 
+    step: int
     expected: dict[TrackKey, Expected]
     associated: dict[TrackKey, int]
     updated: dict[TrackKey, Estimate]
     deleted: set[TrackKey]
     initiated: set[TrackKey]
     live: dict[TrackKey, Estimate]
+
+    def source(self, key: TrackKey) -> int:
+        """Detection that updated or initiated a live track on this step, else `NO_DETECTION`."""
+        born_from = key[1] if key in self.initiated else NO_DETECTION
+        return self.associated.get(key, born_from)
 
 
 class StoneSoupTracker:
@@ -99,8 +107,9 @@ class StoneSoupTracker:
         self.index = index
         self.tracker._tracks = to_stone_soup_tracks(tracks, time_of(index, self.params))
 
-    def export(self, max_tracks: int, updated_by: dict[TrackKey, int]) -> Tracks:
-        """The jaxtrack track list of the live tracks."""
+    def export(self, max_tracks: int, record: StepRecord | None = None) -> Tracks:
+        """The live tracks as jaxtrack's track list, with the sources that `record` knows."""
+        updated_by = {key: record.source(key) for key in record.live} if record else {}
         return to_tracks(self.tracks, self.index, max_tracks, updated_by)
 
     def step(self, value: np.ndarray, active: np.ndarray | None = None) -> StepRecord:
@@ -124,11 +133,12 @@ class StoneSoupTracker:
 
         after = {track_key(track): track for track in self.tracks}
         return StepRecord(
+            step=self.index,
             expected=expected,
             associated={
-                key: detection_index(track.hypothesis.measurement)
+                key: detection_index(track.state.hypothesis.measurement)
                 for key, track in before.items()
-                if hasattr(track.state, "hypothesis")
+                if isinstance(track.state, Update)
             },
             updated={key: estimate(track) for key, track in before.items()},
             deleted=before.keys() - after.keys(),

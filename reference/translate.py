@@ -19,7 +19,7 @@ from stonesoup.types.state import GaussianState, State
 from stonesoup.types.track import Track
 from stonesoup.types.update import GaussianStateUpdate
 
-from jaxtrack.types import NO_DETECTION, STATE_DIM, Detections, Tracks, Truths
+from jaxtrack.types import NO_DETECTION, STATE_DIM, Tracks, Truths
 
 TrackKey = tuple[int, int]
 """Birth step and birth detection of a track."""
@@ -79,7 +79,7 @@ def to_stone_soup_tracks(tracks: Tracks, time: datetime.datetime) -> set[Track]:
 def to_tracks(
     stone_soup_tracks: Iterable[Track], step: int, max_tracks: int, updated_by: dict[TrackKey, int]
 ) -> Tracks:
-    """The jaxtrack track list of Stone Soup tracks, in the order of their keys.
+    """Track list of jaxtrack for Stone Soup tracks, in the order of their keys.
 
     Args:
         stone_soup_tracks: the live tracks.
@@ -112,15 +112,6 @@ def to_tracks(
         birth_detection=jnp.asarray(births[:, 1]),
         age=jnp.asarray(np.where(active, step - births[:, 0], 0)),
     )
-
-
-def to_records(value: np.ndarray, capacity: int | None = None) -> Detections:
-    """The jaxtrack detections of `value` `[D, 3]`, padded with empty rows to `capacity`."""
-    rows = len(value)
-    capacity = rows if capacity is None else capacity
-    padded = np.zeros((capacity, 3))
-    padded[:rows] = value
-    return Detections.from_values(jnp.asarray(padded, float), jnp.arange(capacity) < rows)
 
 
 def to_states(truths: Truths, time: datetime.datetime) -> list[State]:

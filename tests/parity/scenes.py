@@ -3,8 +3,8 @@
 import jax.numpy as jnp
 import numpy as np
 
-from jaxtrack import NO_DETECTION, Detections, Params, Tracks
-from reference.components import measurement_model, transition_model
+from jaxtrack import NO_DETECTION, Detections, Tracks
+from reference.components import noise_covariance
 
 AHEAD, BEHIND, UP = (0.3, 0.2), (np.pi, 0.1), (0.5, 1.45)
 """Directions (azimuth, elevation): the plain one, bearing wrap, elevation fold."""
@@ -39,7 +39,7 @@ def random_covariances(rng, count):
 def track_list(mean, covariance, max_tracks=None):
     """Track list with one track per row, born on step 0 from detections 0, 1, ..."""
     count = len(mean)
-    padding = (max_tracks or count) - count
+    padding = 0 if max_tracks is None else max_tracks - count
     active = np.arange(count + padding) < count
     return Tracks(
         mean=jnp.asarray(np.pad(mean, ((0, padding), (0, 0)))),
@@ -52,8 +52,9 @@ def track_list(mean, covariance, max_tracks=None):
     )
 
 
-def random_tracks(rng, count, towards=AHEAD, max_tracks=None, spread=0.05):
-    return track_list(random_means(rng, count, towards, spread), random_covariances(rng, count), max_tracks)
+def random_tracks(rng, count, towards=AHEAD, max_tracks=None, spread=0.05, distance=(1500.0, 6000.0)):
+    mean = random_means(rng, count, towards, spread, distance)
+    return track_list(mean, random_covariances(rng, count), max_tracks)
 
 
 def detections_near(rng, tracks, params, count, sigmas=1.5):
@@ -67,7 +68,7 @@ def detections_near(rng, tracks, params, count, sigmas=1.5):
     value = np.stack(
         [np.arcsin(points[:, 2] / distance), np.arctan2(points[:, 1], points[:, 0]), distance], axis=1
     )
-    noise = np.sqrt(np.diag(measurement_model(params).noise_covar))
+    noise = np.sqrt(np.diag(noise_covariance(params)))
     return value + noise * rng.standard_normal((count, 3))
 
 
@@ -77,7 +78,3 @@ def padded(value, capacity):
     full = np.zeros((capacity, 3))
     full[:rows] = value
     return Detections.from_values(jnp.asarray(full), jnp.arange(capacity) < rows)
-
-
-def transition(params: Params):
-    return transition_model(params.process_noise)

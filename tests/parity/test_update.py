@@ -16,7 +16,8 @@ from jaxtrack import Detections, Params, association, kalman, models
 from reference.components import build_components, measurement_model
 from reference.pipeline import estimate
 from reference.translate import as_vector, to_detections
-from tests.parity.compare import (
+
+from .compare import (
     TOLERANCE,
     covariance_error,
     cross_covariance_error,
@@ -24,7 +25,7 @@ from tests.parity.compare import (
     estimate_error,
     mean_error,
 )
-from tests.parity.scenes import AHEAD, BEHIND, UP, random_covariances, random_means, track_list
+from .scenes import AHEAD, BEHIND, UP, random_covariances, random_means, track_list
 
 NOW = datetime.datetime(2000, 1, 1)
 EXPECT = jax.jit(kalman.predict_detections)
