@@ -137,7 +137,7 @@ def _per_gate(initialise: nn.initializers.Initializer) -> nn.initializers.Initia
 
     def init(key: jax.Array, shape: tuple[int, int], dtype: Dtype = jnp.float32) -> jax.Array:
         fan_in, fan_out = shape[0], shape[1] // 3
-        gates = [initialise(gate_key, (fan_in, fan_out), dtype) for gate_key in jax.random.split(key, 3)]
-        return jnp.concatenate(gates, axis=-1)
+        gates = jax.vmap(lambda key: initialise(key, (fan_in, fan_out), dtype))(jax.random.split(key, 3))
+        return jnp.concatenate(list(gates), axis=-1)
 
     return init
