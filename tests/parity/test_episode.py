@@ -5,6 +5,7 @@ Both must take the same decision on every step: births, associations, deletions.
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import pytest
 
 from jaxtrack import NO_DETECTION, Detections, Params, SearchTrack, StaticParams, Tracks, models, tracker
@@ -120,3 +121,26 @@ def test_behind_the_radar():
     happened = check_episode(jax.device_get(detections), tracks, made, params, steps)
     assert happened["updates"] > 0.2 * steps
     assert happened["births"] > happened["deletions"] >= 2
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(20))
+def test_ten_thousand_random_scenario_steps(seed):
+    """Twenty episodes of 500 steps, every number of the tracker drawn at random."""
+    rng = np.random.default_rng(seed)
+    params = Params(
+        time_step=int(rng.integers(5, 40)) / 1000,
+        truth_process_noise=rng.uniform(0, 20),
+        process_noise=rng.uniform(0.1, 20),
+        elevation_sigma=rng.uniform(0.5e-3, 5e-3),
+        bearing_sigma=rng.uniform(0.5e-3, 5e-3),
+        range_sigma=rng.uniform(1, 20),
+        gate_threshold=rng.uniform(2, 6),
+        missed_distance=rng.uniform(2, 6),
+        prior_velocity_sigma=rng.uniform(15, 35),
+        deletion_threshold=rng.uniform(4000, 6000),
+        detection_probability=rng.uniform(0.6, 1),
+        clutter_rate=rng.uniform(0, 0.2),
+    )
+    detections, tracks, made = jax.device_get(RECORD(params, seed))
+    assert check_episode(detections, tracks, made, params, 500)["updates"] > 50

@@ -22,7 +22,10 @@ def test_one_step(seed, towards):
     rng = np.random.default_rng(seed)
     params = Params(time_step=float(rng.choice([0.005, 0.05, 1.0])), deletion_threshold=900.0)
     tracks = random_tracks(rng, 6, towards, max_tracks=20)
-    check_step(tracks, detections_near(rng, tracks, params, count=8), params)
+    near = detections_near(rng, tracks, params, count=6)
+    # Clutter in the opposite hemisphere: differences of elevations beyond a right angle are folded.
+    far = np.array([[-1.4 * np.sign(towards[1]), 2.0, 800.0], [-0.9, rng.uniform(-3, 3), 5000.0]])
+    check_step(tracks, np.concatenate([near, far]), params)
 
 
 @pytest.mark.parametrize("towards", [AHEAD, BEHIND, UP], ids=["ahead", "behind", "up"])
