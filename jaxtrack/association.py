@@ -20,7 +20,8 @@ def mahalanobis_distances(expected: ExpectedDetections, detections: Detections) 
     """
     inverse_S = jax.vmap(inverse_3x3)(expected.covariance)
     d = wrap_detection(expected.mean[:, None] - detections.value[None])
-    return jnp.sqrt(jnp.einsum("tdi,tij,tdj->td", d, inverse_S, d))
+    weighted = (d[..., None] * inverse_S[:, None]).sum(axis=-2)
+    return jnp.sqrt((weighted * d).sum(axis=-1))
 
 
 def gate(

@@ -8,9 +8,14 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from jaxtrack.models import constant_velocity, elevation_bearing_range, wrap_detection
+from jaxtrack.models import (
+    constant_velocity,
+    elevation_bearing_range,
+    spherical_offsets,
+    wrap_detection,
+)
 from jaxtrack.params import Params
-from jaxtrack.types import NO_DETECTION, STATE_DIM, Detections, Tracks, where_rows
+from jaxtrack.types import NO_DETECTION, STATE_DIM, Detections, Tracks, position, where_rows
 
 
 @struct.dataclass
@@ -77,14 +82,14 @@ def update(
     )
 
 
-def sigma_points(mean: jax.Array, covariance: jax.Array, params: Params) -> jax.Array:
-    """Sigma points `[13, 6]`: the mean, then plus and minus the scaled Cholesky columns.
+def sigma_offsets(covariance: jax.Array, params: Params) -> jax.Array:
+    """Offsets `[12, 6]` of the sigma points from the mean: plus and minus the scaled Cholesky columns.
 
     Only the lower triangle of `covariance` is read, as LAPACK does for Stone Soup.
     """
     spread = jnp.sqrt(params.alpha**2 * (STATE_DIM + params.kappa))
     columns = spread * cholesky(covariance).T
-    return jnp.concatenate([mean[None], mean + columns, mean - columns])
+    return jnp.concatenate([columns, -columns])
 
 
 def unscented_weights(params: Params) -> tuple[jax.Array, jax.Array]:
@@ -133,31 +138,50 @@ def measurement_noise(params: Params) -> jax.Array:
 def _predict_detection(
     mean: jax.Array, covariance: jax.Array, params: Params
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Unscented measurement prediction of one track: mean, S, cross-covariance."""
-    points = sigma_points(mean, covariance, params)
-    centre_weight, weight = unscented_weights(params)
-    Z = elevation_bearing_range(points)
-    z = _circular_mean(Z, weight)
-    D = wrap_detection(Z - z)
-    S = weight * D[1:].T @ D[1:] + centre_weight * jnp.outer(D[0], D[0]) + measurement_noise(params)
-    C = weight * (points[1:] - mean).T @ D[1:]
-    return z, S, C
+    """Unscented measurement prediction of one track: mean, S, cross-covariance.
 
-
-def _circular_mean(Z: jax.Array, weight: jax.Array) -> jax.Array:
-    """Weighted mean of `[13, 3]` predicted detections; angles by their sines and cosines.
-
-    Equal to ``atan2(sum w sin, sum w cos)`` over all points, turned so that the centre point
-    is at zero: with weights that sum to 1 its large negative weight then cancels exactly
-    instead of in rounding, which is what makes float32 possible.
+    All detections are taken relative to the centre point's. With weights that sum to 1 its
+    large negative weight then cancels exactly instead of in rounding, which is what makes
+    float32 possible. The numbers are those of ``zbar = sum w z`` and
+    ``S = sum w (z - zbar)(z - zbar)^T + R``, angles averaged by their sines and cosines.
     """
-    offsets = Z[1:] - Z[0]
-    angles = offsets[:, :2]
-    sine = weight * jnp.sin(angles).sum(axis=0)
-    # 1 - cos = 2 sin^2(half) without cancellation.
-    cosine = 1 - weight * (2 * jnp.sin(angles / 2) ** 2).sum(axis=0)
-    mean_offset = jnp.append(jnp.arctan2(sine, cosine), weight * offsets[:, 2].sum())
-    return wrap_detection(Z[0] + mean_offset)
+    offsets = sigma_offsets(covariance, params)
+    centre_weight, weight = unscented_weights(params)
+    sine, cosine, range_change = spherical_offsets(position(mean), position(offsets))
+
+    centre = elevation_bearing_range(mean)
+    angles = jnp.arctan2(weight * sine.sum(axis=0), 1 - weight * (1 - cosine).sum(axis=0))
+    z = wrap_detection(centre + jnp.append(angles, weight * range_change.sum()))
+
+    shift = z - centre
+    D = _differences(sine, cosine, range_change, shift)
+    D0 = wrap_detection(-shift)
+    S = weight * _sum_of_outer(D, D) + centre_weight * jnp.outer(D0, D0) + measurement_noise(params)
+    # The offsets come in pairs of opposite sign: half the products do.
+    half = STATE_DIM
+    return z, S, weight * _sum_of_outer(offsets[:half], D[:half] - D[half:])
+
+
+def _sum_of_outer(a: jax.Array, b: jax.Array) -> jax.Array:
+    """``a^T b`` written as a sum, which for matrices this small is faster than a product."""
+    return (a[:, :, None] * b[:, None]).sum(axis=0)
+
+
+def _differences(sine: jax.Array, cosine: jax.Array, range_change: jax.Array, shift: jax.Array) -> jax.Array:
+    """Differences `[12, 3]` of the sigma points' detections from their mean, which lies at `shift`.
+
+    The angles are turned back by the shift; the elevation's is folded, as Stone Soup does.
+    """
+    turn_sine, turn_cosine = jnp.sin(shift[:2]), jnp.cos(shift[:2])
+    sine, cosine = sine * turn_cosine - cosine * turn_sine, cosine * turn_cosine + sine * turn_sine
+    return jnp.stack(
+        [
+            jnp.arctan2(sine[:, 0], jnp.abs(cosine[:, 0])),
+            jnp.arctan2(sine[:, 1], cosine[:, 1]),
+            range_change - shift[2],
+        ],
+        axis=-1,
+    )
 
 
 def _update_one(

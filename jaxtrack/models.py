@@ -66,6 +66,39 @@ def spherical(points: jax.Array) -> jax.Array:
     )
 
 
+def spherical_offsets(centre: jax.Array, displacement: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Change of elevation, bearing and range from `centre` to ``centre + displacement``.
+
+    Taken from cross and dot products, so that nothing cancels in float32 and no angle is
+    computed twice.
+
+    Args:
+        centre: `[3]` position (m).
+        displacement: `[..., 3]` (m).
+
+    Returns:
+        Sines `[..., 2]` and cosines `[..., 2]` of the changes of elevation and bearing, and
+        the changes of range `[...]` (m).
+    """
+    x, y, z = centre[0], centre[1], centre[2]
+    dx, dy, dz = displacement[..., 0], displacement[..., 1], displacement[..., 2]
+    ground = jnp.sqrt((x + dx) ** 2 + (y + dy) ** 2)
+    slant = jnp.sqrt(ground**2 + (z + dz) ** 2)
+    ground_centre = jnp.sqrt(x**2 + y**2)
+    slant_centre = jnp.sqrt(ground_centre**2 + z**2)
+    ground_square_change = (2 * x + dx) * dx + (2 * y + dy) * dy
+    ground_change = ground_square_change / (ground + ground_centre)
+    range_change = (ground_square_change + (2 * z + dz) * dz) / (slant + slant_centre)
+    slants, grounds = slant * slant_centre, ground * ground_centre
+    sine = jnp.stack(
+        [(dz * ground_centre - z * ground_change) / slants, (x * dy - y * dx) / grounds], axis=-1
+    )
+    cosine = jnp.stack(
+        [(grounds + (z + dz) * z) / slants, (x * (x + dx) + y * (y + dy)) / grounds], axis=-1
+    )
+    return sine, cosine, range_change
+
+
 def direction(azimuth: jax.Array, elevation: jax.Array) -> jax.Array:
     """Unit vectors `[..., 3]` towards azimuth and elevation (rad) of equal shapes."""
     return jnp.stack(

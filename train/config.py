@@ -1,0 +1,167 @@
+"""The configuration of a training run: one dataclass, checked before anything is written."""
+
+import dataclasses
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+from jaxtrack.params import Params, StaticParams, validate
+from train.agents import AGENTS
+
+
+@dataclasses.dataclass(frozen=True)
+class TrainConfig:
+    """Everything a run depends on; saved beside its results as config.json."""
+
+    encoder: str = "cells"
+    """Policy to train: cells (one logit per look from per-cell features), or the paper's
+    track-list encoders flatten, bigru, mhsa."""
+    total_steps: int = 1_000_000
+    """Environment steps, rounded down to whole updates."""
+    num_envs: int = 64
+    """Environments that run side by side."""
+    seed: int = 0
+    """Seed of everything random."""
+    out: str = ""
+    """Folder of the run; it must not exist. Empty: runs/ENCODER-seedSEED-TIME."""
+    evaluation_episodes: int = 100
+    """Scenarios on which the agent and all baselines are compared at the end; 0 skips it."""
+    checkpoint_every: int = 20
+    """Updates between checkpoints; one is always written at the end."""
+
+    rollout_steps: int = 128
+    """Steps of every environment per update."""
+    epochs: int = 4
+    """Passes over the samples of an update."""
+    num_minibatches: int = 8
+    """Optimiser steps per pass."""
+    microbatch: int = 128
+    """Samples per piece of a gradient, for the cache; changes nothing but speed."""
+    learning_rate: float = 1e-3
+    """Adam's step size at the start."""
+    anneal: bool = True
+    """Let the learning rate fall to zero, linearly."""
+    gamma: float = 0.99
+    """Discount per step."""
+    gae_lambda: float = 0.95
+    """Decay of the advantage estimate."""
+    clip: float = 0.2
+    """Largest change of a probability ratio that is rewarded."""
+    entropy_coefficient: float = 0.005
+    """Weight of the entropy bonus."""
+    value_coefficient: float = 0.5
+    """Weight of the value error."""
+    max_grad_norm: float = 0.5
+    """Gradients are scaled down to this global norm."""
+    reward_scale: float = 0.1
+    """Factor on rewards in the learner, so that values are near 1; logged returns are unscaled."""
+
+    static: StaticParams = dataclasses.field(default_factory=lambda: StaticParams(reward="information"))
+    """Shapes of the environment."""
+    params: Params = dataclasses.field(default_factory=Params)
+    """Numbers of the environment."""
+
+    @property
+    def batch_size(self) -> int:
+        """Samples per update."""
+        return self.num_envs * self.rollout_steps
+
+    @property
+    def minibatch_size(self) -> int:
+        """Samples per optimiser step."""
+        return self.batch_size // self.num_minibatches
+
+    @property
+    def num_updates(self) -> int:
+        """Updates of the whole run."""
+        return self.total_steps // self.batch_size
+
+
+_AT_LEAST_ONE = ("total_steps", "num_envs", "rollout_steps", "epochs", "num_minibatches", "microbatch")
+_SHARES = ("gamma", "gae_lambda")
+_POSITIVE = ("learning_rate", "clip", "max_grad_norm", "reward_scale")
+_NOT_NEGATIVE = ("entropy_coefficient", "value_coefficient")
+
+
+def check(config: TrainConfig) -> None:
+    """Refuses a configuration that can not run.
+
+    Raises:
+        ValueError: one line that names the field, its value and what is allowed.
+    """
+    if config.encoder not in AGENTS:
+        raise ValueError(f"encoder = {config.encoder!r}: expected one of {', '.join(AGENTS)}")
+    for name in _AT_LEAST_ONE:
+        _require(config, name, getattr(config, name) >= 1, "an integer >= 1")
+    for name in ("evaluation_episodes", "seed"):
+        _require(config, name, getattr(config, name) >= 0, "an integer >= 0")
+    _require(config, "checkpoint_every", config.checkpoint_every >= 1, "an integer >= 1")
+    for name in _SHARES:
+        _require(config, name, 0 <= getattr(config, name) <= 1, "a number in [0, 1]")
+    for name in _POSITIVE:
+        _require(config, name, 0 < getattr(config, name) < math.inf, "a number > 0")
+    for name in _NOT_NEGATIVE:
+        _require(config, name, 0 <= getattr(config, name) < math.inf, "a number >= 0")
+    _check_batches(config)
+    if config.static.continuous_actions:
+        raise ValueError("static.continuous_actions = True: expected False, the agents choose discrete looks")
+    validate(config.static, config.params)
+    out = Path(config.out)
+    _require(config, "out", not config.out or not out.exists(), "a folder that does not exist yet")
+
+
+def _check_batches(config: TrainConfig) -> None:
+    samples = f"num_envs x rollout_steps = {config.batch_size}"
+    _require(
+        config,
+        "num_minibatches",
+        config.batch_size % config.num_minibatches == 0,
+        f"a divisor of {samples} samples",
+    )
+    _require(
+        config,
+        "microbatch",
+        config.minibatch_size % config.microbatch == 0,
+        f"a divisor of the minibatch of {config.minibatch_size} samples",
+    )
+    _require(
+        config, "total_steps", config.num_updates >= 1, f"at least one update: >= {samples}"
+    )
+
+
+def _require(config: TrainConfig, name: str, holds: bool, expected: str) -> None:
+    if not holds:
+        raise ValueError(f"{name} = {getattr(config, name)!r}: expected {expected}")
+
+
+def to_dict(config: TrainConfig) -> dict[str, Any]:
+    """Plain nested dictionary, for JSON."""
+    return dataclasses.asdict(config)
+
+
+def from_dict(values: dict[str, Any]) -> TrainConfig:
+    """Inverse of `to_dict`; missing fields keep their defaults.
+
+    Raises:
+        ValueError: naming a field that does not exist or has the wrong type.
+    """
+    default = TrainConfig()
+    static = _replace(default.static, values.get("static", {}), "static.")
+    params = _replace(default.params, values.get("params", {}), "params.")
+    flat = {name: value for name, value in values.items() if name not in ("static", "params")}
+    return _replace(dataclasses.replace(default, static=static, params=params), flat, "")
+
+
+def _replace(default: Any, values: dict[str, Any], prefix: str) -> Any:
+    if not isinstance(values, dict):
+        raise ValueError(f"{prefix.rstrip('.')} = {values!r}: expected a table of fields")
+    known = {field.name for field in dataclasses.fields(default)}
+    for name, value in values.items():
+        if name not in known:
+            raise ValueError(f"{prefix}{name}: no such field; expected one of {', '.join(sorted(known))}")
+        expected = type(getattr(default, name))
+        number = expected is float and isinstance(value, int) and not isinstance(value, bool)
+        if not (isinstance(value, expected) or number):
+            raise ValueError(f"{prefix}{name} = {value!r}: expected {expected.__name__}")
+    return dataclasses.replace(default, **values)

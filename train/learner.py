@@ -1,0 +1,277 @@
+"""PPO in graph: collect, estimate advantages, update, as one jitted program.
+
+Plain functions with explicit arguments; `train_step` is the table of contents.
+"""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import optax
+from flax import struct
+
+from jaxtrack.env import EnvState, SearchTrack
+from jaxtrack.params import Params
+from train.agents import Agent
+from train.config import TrainConfig
+from train.gae import advantages
+
+LOGGED = ("completeness", "covariance_norm_mean", "covariance_norm_sum", "live_tracks", "mean_scan_value")
+
+
+@struct.dataclass
+class LearnerState:
+    """Everything that training carries from one update to the next, B environments.
+
+    Attributes:
+        weights: variables of the network.
+        optimiser: state of Adam.
+        env: states of the environments.
+        inputs: network inputs of the current observations.
+        episode_return: `[B]` reward summed since the episode began.
+        episode_length: `[B]` steps since the episode began.
+        key: random key data.
+        update: `[]` updates done.
+    """
+
+    weights: Any
+    optimiser: Any
+    env: EnvState
+    inputs: Any
+    episode_return: jax.Array
+    episode_length: jax.Array
+    key: jax.Array
+    update: jax.Array
+
+
+@struct.dataclass
+class Transition:
+    """One step of B environments, as the update needs it (`[B, ...]`, stacked to `[S, B, ...]`)."""
+
+    inputs: Any
+    action: jax.Array
+    log_prob: jax.Array
+    value: jax.Array
+    final_value: jax.Array
+    reward: jax.Array
+    terminated: jax.Array
+    done: jax.Array
+
+
+@struct.dataclass
+class Sample:
+    """What the loss reads of one step; leading dimensions are whatever the batch has."""
+
+    inputs: Any
+    action: jax.Array
+    log_prob: jax.Array
+    value: jax.Array
+    advantage: jax.Array
+
+
+def make_optimiser(config: TrainConfig) -> optax.GradientTransformation:
+    """Adam on gradients clipped by their global norm, with the learning rate annealed to zero."""
+    steps = config.num_updates * config.epochs * config.num_minibatches
+    rate = optax.linear_schedule(config.learning_rate, 0.0, steps) if config.anneal else config.learning_rate
+    return optax.chain(optax.clip_by_global_norm(config.max_grad_norm), optax.adam(rate, eps=1e-5))
+
+
+def init_learner(key: jax.Array, env: SearchTrack, agent: Agent, config: TrainConfig) -> LearnerState:
+    """Fresh weights and environments.
+
+    The environments start at different times of their episode, so that a rollout holds all
+    phases of an episode and their ends do not fall on one step.
+    """
+    key_env, key_net, key = jax.random.split(key, 3)
+    keys = jax.random.split(key_env, config.num_envs)
+    observation, state = jax.vmap(env.reset_env, in_axes=(0, None))(keys, config.params)
+    phase = jnp.arange(config.num_envs) * config.params.max_steps_in_episode // config.num_envs
+    inputs = jax.vmap(agent.features)(observation)
+    weights = agent.network.init(key_net, inputs)
+    return LearnerState(
+        weights=weights,
+        optimiser=make_optimiser(config).init(weights),
+        env=state.replace(time=phase.astype(state.time.dtype)),
+        inputs=inputs,
+        episode_return=jnp.zeros(config.num_envs),
+        episode_length=jnp.zeros(config.num_envs, dtype=int),
+        key=jax.random.key_data(key),
+        update=jnp.asarray(0),
+    )
+
+
+def train_step(
+    state: LearnerState, env: SearchTrack, agent: Agent, config: TrainConfig
+) -> tuple[LearnerState, dict[str, jax.Array]]:
+    """One update: a rollout of every environment, advantages, and PPO's epochs over them."""
+    key, key_rollout, key_update = jax.random.split(jax.random.wrap_key_data(state.key), 3)
+    state, rollout, rollout_metrics = collect(key_rollout, state, env, agent, config)
+    samples = estimate_advantages(rollout, state, agent, config)
+    weights, optimiser, losses = update_epochs(key_update, state, samples, agent, config)
+    state = state.replace(
+        weights=weights, optimiser=optimiser, key=jax.random.key_data(key), update=state.update + 1
+    )
+    explained = explained_variance(samples.value, samples.advantage)
+    return state, {**rollout_metrics, **losses, "explained_variance": explained}
+
+
+def collect(
+    key: jax.Array, state: LearnerState, env: SearchTrack, agent: Agent, config: TrainConfig
+) -> tuple[LearnerState, Transition, dict[str, jax.Array]]:
+    """Runs every environment for `rollout_steps` steps with the current weights."""
+
+    def one_step(carry: LearnerState, key: jax.Array) -> tuple[LearnerState, tuple[Transition, Any]]:
+        key_action, key_env = jax.random.split(key)
+        logits, value = agent.network.apply(carry.weights, carry.inputs)
+        action = agent.distribution.sample(key_action, logits)
+        keys = jax.random.split(key_env, config.num_envs)
+        observation, env_state, reward, terminated, truncated, info = jax.vmap(
+            env.step, in_axes=(0, 0, 0, None)
+        )(keys, carry.env, action, config.params)
+        done = terminated | truncated
+        transition = Transition(
+            inputs=carry.inputs,
+            action=action,
+            log_prob=agent.distribution.log_prob(logits, action),
+            value=value,
+            final_value=value_at_end(carry.weights, info["final_observation"], done, agent),
+            reward=config.reward_scale * reward,
+            terminated=terminated,
+            done=done,
+        )
+        episode_return, episode_length = carry.episode_return + reward, carry.episode_length + 1
+        finished = {"done": done, "episode_return": episode_return, "episode_length": episode_length}
+        carry = carry.replace(
+            env=env_state,
+            inputs=jax.vmap(agent.features)(observation),
+            episode_return=jnp.where(done, 0.0, episode_return),
+            episode_length=jnp.where(done, 0, episode_length),
+        )
+        return carry, (transition, {**finished, "reward": reward, **{name: info[name] for name in LOGGED}})
+
+    keys = jax.random.split(key, config.rollout_steps)
+    state, (rollout, steps) = jax.lax.scan(one_step, state, keys)
+    return state, rollout, summarise(steps, config.params)
+
+
+def value_at_end(weights: Any, final_observation: Any, done: jax.Array, agent: Agent) -> jax.Array:
+    """Value `[B]` of the final observations; 0 where the episode goes on.
+
+    Most steps end no episode: then nothing is computed.
+    """
+
+    def evaluate() -> jax.Array:
+        _, value = agent.network.apply(weights, jax.vmap(agent.features)(final_observation))
+        return jnp.where(done, value, 0.0)
+
+    return jax.lax.cond(jnp.any(done), evaluate, lambda: jnp.zeros(done.shape))
+
+
+def estimate_advantages(
+    rollout: Transition, state: LearnerState, agent: Agent, config: TrainConfig
+) -> Sample:
+    """Advantages of the rollout `[S, B]`, bootstrapped from the value after its last step."""
+    _, last_value = agent.network.apply(state.weights, state.inputs)
+    following = jnp.concatenate([rollout.value[1:], last_value[None]])
+    advantage = advantages(
+        rollout.reward,
+        rollout.value,
+        jnp.where(rollout.done, rollout.final_value, following),
+        rollout.terminated,
+        rollout.done,
+        config.gamma,
+        config.gae_lambda,
+    )
+    return Sample(rollout.inputs, rollout.action, rollout.log_prob, rollout.value, advantage)
+
+
+def update_epochs(
+    key: jax.Array, state: LearnerState, samples: Sample, agent: Agent, config: TrainConfig
+) -> tuple[Any, Any, dict[str, jax.Array]]:
+    """PPO's epochs: each shuffles all samples and takes an optimiser step per minibatch."""
+    flat = jax.tree.map(lambda leaf: leaf.reshape(config.batch_size, *leaf.shape[2:]), samples)
+    optimiser = make_optimiser(config)
+
+    def one_minibatch(carry: tuple[Any, Any], rows: jax.Array) -> tuple[tuple[Any, Any], Any]:
+        weights, optimiser_state = carry
+        minibatch = jax.tree.map(lambda leaf: leaf[rows], flat)
+        grads, losses = minibatch_gradient(weights, minibatch, agent, config)
+        updates, optimiser_state = optimiser.update(grads, optimiser_state, weights)
+        losses["gradient_norm"] = optax.global_norm(grads)
+        return (optax.apply_updates(weights, updates), optimiser_state), losses
+
+    def one_epoch(carry: tuple[Any, Any], key: jax.Array) -> tuple[tuple[Any, Any], Any]:
+        order = jax.random.permutation(key, config.batch_size)
+        return jax.lax.scan(one_minibatch, carry, order.reshape(config.num_minibatches, -1))
+
+    carry = (state.weights, state.optimiser)
+    carry, losses = jax.lax.scan(one_epoch, carry, jax.random.split(key, config.epochs))
+    return *carry, jax.tree.map(jnp.mean, losses)
+
+
+def minibatch_gradient(
+    weights: Any, minibatch: Sample, agent: Agent, config: TrainConfig
+) -> tuple[Any, dict[str, jax.Array]]:
+    """Gradient of the loss over a minibatch, summed over pieces small enough for the cache."""
+    spread = minibatch.advantage.std() + 1e-8
+    normalised = (minibatch.advantage - minibatch.advantage.mean()) / spread
+    target = minibatch.value + minibatch.advantage
+    pieces = config.minibatch_size // config.microbatch
+    split = jax.tree.map(
+        lambda leaf: leaf.reshape(pieces, config.microbatch, *leaf.shape[1:]),
+        (minibatch, normalised, target),
+    )
+
+    def add_piece(total: Any, piece: Any) -> tuple[Any, None]:
+        return jax.tree.map(jnp.add, total, gradient(weights, *piece, agent, config)), None
+
+    gradient = jax.grad(ppo_loss, has_aux=True)
+    zeros = jax.tree.map(
+        lambda leaf: jnp.zeros(leaf.shape, leaf.dtype),
+        jax.eval_shape(
+            lambda piece: gradient(weights, *piece, agent, config), jax.tree.map(lambda x: x[0], split)
+        ),
+    )
+    total, _ = jax.lax.scan(add_piece, zeros, split)
+    return jax.tree.map(lambda leaf: leaf / pieces, total)
+
+
+def ppo_loss(
+    weights: Any,
+    samples: Sample,
+    advantage: jax.Array,
+    target: jax.Array,
+    agent: Agent,
+    config: TrainConfig,
+) -> tuple[jax.Array, dict[str, jax.Array]]:
+    """Clipped surrogate, value error and entropy (Schulman et al. 2017, eq. 9)."""
+    logits, value = agent.network.apply(weights, samples.inputs)
+    log_ratio = agent.distribution.log_prob(logits, samples.action) - samples.log_prob
+    ratio = jnp.exp(log_ratio)
+    clipped = jnp.clip(ratio, 1 - config.clip, 1 + config.clip)
+    policy_loss = -jnp.minimum(ratio * advantage, clipped * advantage).mean()
+    value_loss = 0.5 * jnp.square(value - target).mean()
+    entropy = agent.distribution.entropy(logits).mean()
+    loss = policy_loss + config.value_coefficient * value_loss - config.entropy_coefficient * entropy
+    return loss, {
+        "policy_loss": policy_loss,
+        "value_loss": value_loss,
+        "entropy": entropy,
+        "approximate_kl": ((ratio - 1) - log_ratio).mean(),
+        "clip_fraction": (jnp.abs(ratio - 1) > config.clip).mean(),
+    }
+
+
+def summarise(steps: dict[str, jax.Array], params: Params) -> dict[str, jax.Array]:
+    """Means over a rollout; episode returns over whole episodes only, NaN where none ended."""
+    whole = steps["done"] & (steps["episode_length"] == params.max_steps_in_episode)
+    count = whole.sum()
+    total = jnp.where(whole, steps["episode_return"], 0.0).sum()
+    means = {name: steps[name].mean() for name in ("reward", *LOGGED)}
+    return {**means, "episodes": count, "episode_return": jnp.where(count > 0, total / count, jnp.nan)}
+
+
+def explained_variance(value: jax.Array, advantage: jax.Array) -> jax.Array:
+    """Share of the returns' variance that the values explain; 1 is perfect."""
+    target = value + advantage
+    return 1 - advantage.var() / jnp.maximum(target.var(), 1e-12)
