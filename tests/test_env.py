@@ -166,9 +166,7 @@ def test_a_batch_over_keys_and_numbers_equals_a_loop_and_compiles_once(env):
         actions = jnp.array([[count, 1], [2, count]])
         observations, states, rewards, _, truncated, _ = step(keys, states, actions, batch)
         for row in range(2):
-            observation, alone[row], reward, *_ = env.step(
-                keys[row], alone[row], actions[row], row_of(batch, row)
-            )
+            observation, alone[row], reward, *_ = env.step(keys[row], alone[row], actions[row], numbers[row])
             chex.assert_trees_all_close(observation, row_of(observations, row), rtol=1e-3, atol=1e-3)
             np.testing.assert_allclose(rewards[row], reward, rtol=1e-3, atol=1e-3)
         np.testing.assert_array_equal(truncated, [False, count == 1])
@@ -185,7 +183,7 @@ def test_actions_out_of_range_are_looks_at_the_edge(env, episode):
     assert float(edge[0]["scan_map"][-1, 0]) == 0.0
 
 
-def test_continuous_actions_and_recorded_truths():
+def test_continuous_actions_and_recorded_truths_in_double_precision(x64):
     recorded = np.zeros((3, 2, 6))
     # Straight ahead, the second one present at time 2 only.
     recorded[:, :, 0] = [[3000, np.nan], [3001, np.nan], [3002, 5000]]
@@ -204,16 +202,10 @@ def test_continuous_actions_and_recorded_truths():
         assert np.isfinite(reward)
     assert seen == [1, 2, 0, 0]
     np.testing.assert_array_equal(state.truths.state[:, 0], [3002, 5000])
+    assert state.tracks.mean.dtype == state.scan_map.dtype == reward.dtype == jnp.float64
 
 
 def test_recorded_truths_of_a_wrong_shape_are_refused(env):
     params = PARAMS.replace(trajectories=jnp.zeros((5, 2, 6)))
     with pytest.raises(ValueError, match=r"^trajectories has shape \(5, 2, 6\): expected"):
         env.reset(jax.random.key(0), params)
-
-
-def test_double_precision(env, x64):
-    history, results = play(env, PARAMS, seed=0, steps=3)
-    assert history[-1][1].tracks.mean.dtype == jnp.float64
-    assert history[-1][0]["tracks"].dtype == jnp.float64
-    assert all(np.isfinite(result[0]) for result in results)

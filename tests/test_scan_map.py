@@ -11,6 +11,7 @@ STATIC = StaticParams(map_size=12, num_looks=5)
 # Seconds rather than milliseconds, so that the map ages visibly between looks.
 PARAMS = Params(time_step=0.25, scan_time_constant=0.8, beam_azimuth=0.5, beam_elevation=0.3)
 update = jax.jit(scan_map.update_scan_map, static_argnums=2)
+beam_weights = jax.jit(scan_map.beam_weights, static_argnums=0)
 
 
 def pixel_angles():
@@ -82,7 +83,7 @@ def test_the_grid_of_looks_counts_azimuth_first():
 @pytest.mark.parametrize("continuous", [False, True])
 def test_beam_weights_give_the_mean_scan_value_in_every_beam(continuous):
     static = StaticParams(map_size=12, num_looks=5, continuous_actions=continuous)
-    weights = np.asarray(jax.jit(scan_map.beam_weights, static_argnums=0)(static, PARAMS))
+    weights = np.asarray(beam_weights(static, PARAMS))
     values = np.random.default_rng(1).uniform(size=(12, 12))
     angles = np.linspace(-PARAMS.field_limit, PARAMS.field_limit, 5)
     # Away from the edges of the field, where in or out is a matter of the last bit.
@@ -97,5 +98,5 @@ def test_beam_weights_give_the_mean_scan_value_in_every_beam(continuous):
 
 def test_a_beam_between_the_pixels_has_no_weight():
     narrow = Params(beam_azimuth=1e-4, beam_elevation=1e-4)
-    weights = scan_map.beam_weights(StaticParams(map_size=2, num_looks=3), narrow)
+    weights = beam_weights(StaticParams(map_size=2, num_looks=3), narrow)
     assert float(jnp.sum(weights[4])) == 0.0
