@@ -117,10 +117,13 @@ def test_orthogonal_gains(initialised):
     assert not np.allclose(gates[0], gates[1])
 
 
-def test_learns_to_point_at_the_first_track(network):
-    """Supervised: from the track list alone, the head must find the bin of the first live track."""
-    network, variables = network
-    n = 64
+def test_learns_to_point_at_the_first_track(initialised):
+    """Supervised: from the track list alone, the head must find the bin of the first live track.
+
+    Only through attention and BiGRU, the deepest of the encoders, as each costs seconds to compile.
+    """
+    network, variables = initialised
+    n = 32
     keys = jax.random.split(jax.random.key(4), 2)
     mask = jnp.ones((n, T), bool).at[:, 3:].set(False)
     tracks = jnp.where(mask[..., None], jax.random.uniform(keys[0], (n, T, 7), minval=-1), jnp.nan)
@@ -138,7 +141,7 @@ def test_learns_to_point_at_the_first_track(network):
         change, state = optimiser.update(gradient, state)
         return (optax.apply_updates(variables, change), state), value
 
-    (_, _), losses = jax.jit(lambda c: jax.lax.scan(update, c, length=60))(
+    (_, _), losses = jax.jit(lambda c: jax.lax.scan(update, c, length=40))(
         (variables, optimiser.init(variables))
     )
     assert np.all(np.isfinite(losses))

@@ -41,7 +41,7 @@ def assert_trees_close(got, expected, tolerance=2e-5):
 
 @pytest.mark.parametrize(
     ("height", "width", "channels", "size", "stride"),
-    [(11, 13, 5, 4, 2), (4, 4, 6, 3, 1), (13, 18, 1, 6, 3)],
+    [(11, 13, 5, 4, 2), (13, 18, 1, 6, 3)],
 )
 def test_convolution_equals_flax(draw_variables, height, width, channels, size, stride):
     images = jax.random.normal(jax.random.key(0), (3, height, width, channels))
