@@ -28,15 +28,14 @@ def pointing_or_random(key, state, env, params):
 
 
 def environment_episode(params, seed):
-    """Detections `[K, D]`, track lists and tracker records of one episode of the environment."""
-
+    """Truths, detections, track lists and tracker records of one episode, each `[K, ...]`."""
     env = SearchTrack(SHAPES)
 
     def one_step(state, key):
         key_action, key_noise = jax.random.split(key)
         action = pointing_or_random(key_action, state, env, params)
         state, record = env.advance(state, action, env.sample_noise(key_noise), params)
-        return state, (record.detections, state.tracks, decisions(record.tracker))
+        return state, (state.truths.state, record.detections, state.tracks, decisions(record.tracker))
 
     key_reset, key_steps = jax.random.split(jax.random.key(seed))
     _, state = env.reset_env(key_reset, params)
@@ -105,16 +104,27 @@ CROWDED = {**HARD, "field_limit": 0.15, "min_range": 2000.0, "max_range": 2200.0
 )
 def test_environment_episode(numbers, seed, steps):
     params = Params(**numbers)
-    detections, tracks, made = jax.device_get(RECORD(params, seed))
+    _, detections, tracks, made = jax.device_get(RECORD(params, seed))
     happened = check_episode(detections, tracks, made, params, steps)
     assert happened["updates"] > 0.2 * steps
     assert happened["births"] > happened["deletions"] >= 2
 
 
+def test_truths_move_before_the_radar_looks():
+    """As in Stone Soup's loop: with a perfect radar the detections are the present truths."""
+    params = Params(elevation_sigma=1e-9, bearing_sigma=1e-9, range_sigma=1e-6)
+    truths, detections, _, _ = jax.device_get(RECORD(params, 5))
+    step, row = np.nonzero(detections.active)
+    seen = truths[step, detections.truth[step, row]]
+    offsets = np.asarray(detections.value[step, row] - models.elevation_bearing_range(seen))
+    assert len(step) > 300
+    assert np.abs(offsets / [1e-9, 1e-9, 1e-6]).max() < 6.0
+
+
 def test_behind_the_radar():
     """The same field turned by half a turn: bearings jump between -pi and pi all the time."""
     params, steps = Params(**QUICK), 250
-    recorded = RECORD(params, 4)[0]
+    recorded = RECORD(params, 4)[1]
     turned = recorded.value.at[..., 1].set(models.wrap_bearing(recorded.value[..., 1] + jnp.pi))
     detections = Detections(turned, recorded.active, recorded.truth)
     tracks, made = jax.device_get(REPLAY(detections, params, 40))
@@ -142,5 +152,5 @@ def test_ten_thousand_random_scenario_steps(seed):
         detection_probability=rng.uniform(0.6, 1),
         clutter_rate=rng.uniform(0, 0.2),
     )
-    detections, tracks, made = jax.device_get(RECORD(params, seed))
+    _, detections, tracks, made = jax.device_get(RECORD(params, seed))
     assert check_episode(detections, tracks, made, params, 500)["updates"] > 50
