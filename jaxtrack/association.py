@@ -24,9 +24,7 @@ def mahalanobis_distances(expected: ExpectedDetections, detections: Detections) 
     return jnp.sqrt((weighted * d).sum(axis=-1))
 
 
-def gate(
-    distances: jax.Array, predicted: Tracks, detections: Detections, params: Params
-) -> jax.Array:
+def gate(distances: jax.Array, predicted: Tracks, detections: Detections, params: Params) -> jax.Array:
     """Distances `[T, D]` of admissible pairs, infinity elsewhere.
 
     A pair is admissible if track and detection exist and the distance is strictly smaller

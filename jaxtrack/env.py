@@ -39,8 +39,7 @@ class EnvState(environment.EnvState):
     num_initiated: jax.Array
 
 
-@struct.dataclass
-class StepNoise:
+class StepNoise(struct.PyTreeNode):
     """All that is random in one step.
 
     Attributes:
@@ -52,8 +51,7 @@ class StepNoise:
     sensor: SensorNoise
 
 
-@struct.dataclass
-class StepRecord:
+class StepRecord(struct.PyTreeNode):
     """What happened in one step, for rendering and parity tests.
 
     Attributes:

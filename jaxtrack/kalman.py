@@ -15,11 +15,10 @@ from jaxtrack.models import (
     wrap_detection,
 )
 from jaxtrack.params import Params
-from jaxtrack.types import NO_DETECTION, STATE_DIM, Detections, Tracks, position, where_rows
+from jaxtrack.types import NO_DETECTION, STATE_DIM, Detections, Scalar, Tracks, position, where_rows
 
 
-@struct.dataclass
-class ExpectedDetections:
+class ExpectedDetections(struct.PyTreeNode):
     """Measurement prediction of every track (Stone Soup's `GaussianMeasurementPrediction`).
 
     Attributes:
@@ -33,7 +32,7 @@ class ExpectedDetections:
     cross_covariance: jax.Array  # [T, 6, 3]
 
 
-def predict(tracks: Tracks, time_step: jax.Array, params: Params) -> Tracks:
+def predict(tracks: Tracks, time_step: Scalar, params: Params) -> Tracks:
     """Moves every track by `time_step` (s): ``x = F x``, ``P = F P F^T + Q``."""
     F, Q = constant_velocity(time_step, params.process_noise)
     return tracks.replace(

@@ -10,8 +10,7 @@ from jaxtrack.params import Params
 from jaxtrack.types import Tracks, Truths, position
 
 
-@struct.dataclass
-class Gospa:
+class Gospa(struct.PyTreeNode):
     """GOSPA with alpha = 2 (Stone Soup's `GOSPAMetric`), positions only.
 
     The three parts are p-th powers; ``distance = (localisation + missed + false)^(1/p)``.

@@ -7,10 +7,10 @@ and `CartesianToElevationBearingRange` with its typed angles.
 import jax
 import jax.numpy as jnp
 
-from jaxtrack.types import position
+from jaxtrack.types import Scalar, position
 
 
-def constant_velocity(time_step: jax.Array, process_noise: jax.Array) -> tuple[jax.Array, jax.Array]:
+def constant_velocity(time_step: Scalar, process_noise: Scalar) -> tuple[jax.Array, jax.Array]:
     """Transition matrix F and process noise covariance Q of constant velocity in 3-D.
 
     Args:
@@ -45,9 +45,7 @@ def fold_elevation(angle: jax.Array) -> jax.Array:
 
 def wrap_detection(value: jax.Array) -> jax.Array:
     """Folds the elevation and wraps the bearing of `[..., 3]` detections or differences."""
-    return jnp.stack(
-        [fold_elevation(value[..., 0]), wrap_bearing(value[..., 1]), value[..., 2]], axis=-1
-    )
+    return jnp.stack([fold_elevation(value[..., 0]), wrap_bearing(value[..., 1]), value[..., 2]], axis=-1)
 
 
 def elevation_bearing_range(state: jax.Array) -> jax.Array:
@@ -93,9 +91,7 @@ def spherical_offsets(centre: jax.Array, displacement: jax.Array) -> tuple[jax.A
     sine = jnp.stack(
         [(dz * ground_centre - z * ground_change) / slants, (x * dy - y * dx) / grounds], axis=-1
     )
-    cosine = jnp.stack(
-        [(grounds + (z + dz) * z) / slants, (x * (x + dx) + y * (y + dy)) / grounds], axis=-1
-    )
+    cosine = jnp.stack([(grounds + (z + dz) * z) / slants, (x * (x + dx) + y * (y + dy)) / grounds], axis=-1)
     return sine, cosine, range_change
 
 

@@ -55,9 +55,7 @@ class StaticParams:
             if field.type is int and (
                 isinstance(value, bool) or not isinstance(value, int) or value < low.get(field.name, 1)
             ):
-                raise ValueError(
-                    f"{field.name} = {value!r}: expected an integer >= {low.get(field.name, 1)}"
-                )
+                raise ValueError(f"{field.name} = {value!r}: expected an integer >= {low.get(field.name, 1)}")
         if self.reward not in REWARDS:
             raise ValueError(f"reward = {self.reward!r}: expected one of {', '.join(REWARDS)}")
 
@@ -147,9 +145,7 @@ def validate(static: StaticParams, params: Params) -> None:
         if field.metadata and "low" in field.metadata:
             _check_quantity(field, getattr(params, field.name))
     if np.any(np.asarray(params.min_range) > np.asarray(params.max_range)):
-        raise ValueError(
-            f"min_range = {params.min_range}: expected at most max_range = {params.max_range} m"
-        )
+        raise ValueError(f"min_range = {params.min_range}: expected at most max_range = {params.max_range} m")
     if np.any(np.asarray(params.clutter_rate) > static.max_clutter):
         raise ValueError(
             f"clutter_rate = {params.clutter_rate}: expected at most max_clutter = "

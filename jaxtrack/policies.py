@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from jaxtrack.env import EnvState
 
 Policy = Callable[[jax.Array, "EnvState"], jax.Array]
+PolicyBuilder = Callable[[StaticParams, Params], Policy]
 
 REVISIT_SHARE = 0.6
 """The scheduler rule revisits a track whose trace passes this share of the threshold."""
@@ -89,8 +90,10 @@ def scheduler(static: StaticParams, params: Params) -> Policy:
 
 
 def index(static: StaticParams, params: Params) -> Policy:
-    """The look with the largest index: mean scan value in its beam, plus the sum over the tracks in it
-    of trace / deletion threshold.
+    """The look with the largest index.
+
+    The index of a look is the mean scan value in its beam plus, summed over the tracks in it,
+    trace / deletion threshold.
     """
     weights = beam_weights(static, params)
     looks = look_grid(static, params)
@@ -104,7 +107,7 @@ def index(static: StaticParams, params: Params) -> Policy:
     return policy
 
 
-POLICIES: dict[str, Callable[[StaticParams, Params], Policy]] = {
+POLICIES: dict[str, PolicyBuilder] = {
     "random": random,
     "static": static,
     "coverage": coverage,

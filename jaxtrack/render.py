@@ -9,13 +9,14 @@ and the same as a command: ``python -m jaxtrack.render --policy index --seed 0 -
 import dataclasses
 import sys
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import jax
 import numpy as np
 
+from jaxtrack.cli import parse, run
 from jaxtrack.policies import POLICIES
 from jaxtrack.recording import Episode, record_episode
 from jaxtrack.scene import Scene
@@ -196,18 +197,13 @@ def draw(options: Options) -> str:
     )
 
 
-def main() -> None:
-    """The command: exit code 2 and one line on standard error when an option is wrong."""
-    import tyro
-
-    try:
-        options = tyro.cli(Options)
-        check(options)
-        print(draw(options))
-    except (ValueError, OSError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        sys.exit(2)
+def main(argv: Sequence[str]) -> int:
+    """The command."""
+    options = parse(Options(), argv, "python -m jaxtrack.render")
+    check(options)
+    print(draw(options))
+    return 0
 
 
 if __name__ == "__main__":
-    main()
+    run(main)

@@ -13,8 +13,7 @@ from jaxtrack.params import Params, StaticParams
 from jaxtrack.types import NO_TRUTH, Detections, Truths, position
 
 
-@struct.dataclass
-class SensorNoise:
+class SensorNoise(struct.PyTreeNode):
     """The random draws of one look.
 
     Attributes:
@@ -127,9 +126,7 @@ def detect(
     return detections, num_dropped + excess
 
 
-def clutter_count(
-    uniform: jax.Array, static: StaticParams, params: Params
-) -> tuple[jax.Array, jax.Array]:
+def clutter_count(uniform: jax.Array, static: StaticParams, params: Params) -> tuple[jax.Array, jax.Array]:
     """Poisson number of false detections from one uniform draw, and its excess over capacity."""
     counts = jnp.arange(4 * static.max_clutter)
     rate = jnp.asarray(params.clutter_rate, dtype=float)

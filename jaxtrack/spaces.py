@@ -36,7 +36,6 @@ class Dict(spaces.Dict):
         if set(x) != set(self.spaces):
             return jnp.asarray(False)
         inside = [
-            jnp.shape(x[key]) == space.shape and space.contains(x[key])
-            for key, space in self.spaces.items()
+            jnp.shape(x[key]) == space.shape and space.contains(x[key]) for key, space in self.spaces.items()
         ]
         return jnp.all(jnp.array(inside))

@@ -10,11 +10,10 @@ from flax import struct
 from jaxtrack import association, kalman, lifecycle
 from jaxtrack.kalman import ExpectedDetections
 from jaxtrack.params import Params
-from jaxtrack.types import STATE_DIM, Detections, Tracks, where_rows
+from jaxtrack.types import STATE_DIM, Detections, Scalar, Tracks, where_rows
 
 
-@struct.dataclass
-class TrackerInfo:
+class TrackerInfo(struct.PyTreeNode):
     """Every intermediate of one step, for parity tests and diagnosis.
 
     Attributes:
@@ -39,7 +38,7 @@ class TrackerInfo:
 
 
 def step(
-    tracks: Tracks, detections: Detections, time_step: jax.Array, index: jax.Array, params: Params
+    tracks: Tracks, detections: Detections, time_step: Scalar, index: jax.Array, params: Params
 ) -> tuple[Tracks, TrackerInfo]:
     """Predict, gate, associate, update, delete, initiate: in Stone Soup's order.
 
@@ -75,9 +74,7 @@ def step(
     )
 
 
-def _blank_empty_rows(
-    tracks: Tracks, detections: Detections, params: Params
-) -> tuple[Tracks, Detections]:
+def _blank_empty_rows(tracks: Tracks, detections: Detections, params: Params) -> tuple[Tracks, Detections]:
     """Puts harmless numbers into empty rows, so that neither values nor gradients turn NaN."""
     somewhere = jnp.zeros(STATE_DIM).at[0].set(params.min_range)
     tracks = tracks.replace(

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 
 from jaxtrack.models import constant_velocity, direction
 from jaxtrack.params import Params, StaticParams
-from jaxtrack.types import Truths
+from jaxtrack.types import Scalar, Truths
 
 
 def initiate_truths(key: jax.Array, static: StaticParams, params: Params) -> Truths:
@@ -43,7 +43,7 @@ def propagate_truths(truths: Truths, noise: jax.Array, step: jax.Array, params: 
     return truths.replace(state=jnp.einsum("ij,nj->ni", F, truths.state) + shaken)
 
 
-def process_noise_factor(time_step: jax.Array, process_noise: jax.Array) -> jax.Array:
+def process_noise_factor(time_step: Scalar, process_noise: Scalar) -> jax.Array:
     """Lower Cholesky factor `[2, 2]` of one axis of the constant-velocity Q."""
     dt = jnp.asarray(time_step, dtype=float)
     factor = jnp.array(

@@ -12,6 +12,9 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
+Scalar = jax.Array | float
+"""One number, traced or not."""
+
 STATE_DIM = 6
 DETECTION_DIM = 3
 POSITION = (0, 2, 4)
@@ -27,8 +30,7 @@ NEVER = -1
 """Value of `Tracks.birth_step` in slots that never held a track."""
 
 
-@struct.dataclass
-class Truths:
+class Truths(struct.PyTreeNode):
     """True targets, capacity N.
 
     Attributes:
@@ -40,8 +42,7 @@ class Truths:
     alive: jax.Array  # [N] bool
 
 
-@struct.dataclass
-class Detections:
+class Detections(struct.PyTreeNode):
     """What one look returned, capacity D.
 
     Attributes:
@@ -64,8 +65,7 @@ class Detections:
         return cls(value=value, active=active, truth=jnp.full(rows, NO_TRUTH, dtype=int))
 
 
-@struct.dataclass
-class Tracks:
+class Tracks(struct.PyTreeNode):
     """Track list, capacity T. A track keeps its slot for life.
 
     A track is identified by its birth step together with its birth detection.

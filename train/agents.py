@@ -6,9 +6,10 @@ from typing import Any, NamedTuple
 import jax
 from flax import linen as nn
 
+from jaxtrack.env import EnvState
 from jaxtrack.observation import Observation, observe
 from jaxtrack.params import Params, StaticParams
-from jaxtrack.policies import Policy
+from jaxtrack.policies import Policy, PolicyBuilder
 from train.cells import CellGeometry, CellNetwork
 from train.distributions import FACTORED, JOINT, Distribution
 from train.networks import ENCODERS, PaperNetwork
@@ -30,9 +31,17 @@ class Agent(NamedTuple):
     network: nn.Module
     distribution: Distribution
 
+    def evaluate(self, weights: Any, inputs: Any) -> tuple[jax.Array, jax.Array]:
+        """Logits and value of batched inputs."""
+        result: Any = self.network.apply(weights, inputs)
+        return result
+
 
 def build_agent(name: str, static: StaticParams, params: Params) -> Agent:
     """The agent of that name for a scenario.
+
+    Call it inside the jitted program, where `params` are traced: what the geometry fixes is
+    then computed there once, instead of being compiled in as a large constant.
 
     Raises:
         ValueError: if the name is none of `AGENTS`.
@@ -45,15 +54,20 @@ def build_agent(name: str, static: StaticParams, params: Params) -> Agent:
     return Agent(lambda observation: observation, network, FACTORED)
 
 
-def as_policy(agent: Agent, weights: Any, params: Params, greedy: bool = False) -> Policy:
-    """The trained agent behind the signature of the baselines; it samples unless `greedy`."""
+def agent_policy(name: str, weights: Any, greedy: bool = False) -> PolicyBuilder:
+    """A trained agent in the form of the baselines; it samples its looks unless `greedy`."""
 
-    def policy(key: jax.Array, state: Any) -> jax.Array:
-        observation = observe(state.tracks, state.scan_map, params)
-        inputs = jax.tree.map(lambda leaf: leaf[None], agent.features(observation))
-        logits, _ = agent.network.apply(weights, inputs)
-        if greedy:
-            return agent.distribution.mode(logits)[0]
-        return agent.distribution.sample(jax.random.fold_in(key, state.time), logits)[0]
+    def build(static: StaticParams, params: Params) -> Policy:
+        agent = build_agent(name, static, params)
 
-    return policy
+        def policy(key: jax.Array, state: EnvState) -> jax.Array:
+            observation = observe(state.tracks, state.scan_map, params)
+            inputs = jax.tree.map(lambda leaf: leaf[None], agent.features(observation))
+            logits, _ = agent.evaluate(weights, inputs)
+            if greedy:
+                return agent.distribution.mode(logits)[0]
+            return agent.distribution.sample(jax.random.fold_in(key, state.time), logits)[0]
+
+        return policy
+
+    return build

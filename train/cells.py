@@ -19,8 +19,7 @@ CELL_FEATURES = 5
 CONTEXT_FEATURES = 3
 
 
-@struct.dataclass
-class CellInputs:
+class CellInputs(struct.PyTreeNode):
     """What the per-cell network reads, K = L * L cells.
 
     Attributes:

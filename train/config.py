@@ -1,7 +1,6 @@
 """The configuration of a training run: one dataclass, checked before anything is written."""
 
 import dataclasses
-import json
 import math
 from pathlib import Path
 from typing import Any
@@ -125,9 +124,7 @@ def _check_batches(config: TrainConfig) -> None:
         config.minibatch_size % config.microbatch == 0,
         f"a divisor of the minibatch of {config.minibatch_size} samples",
     )
-    _require(
-        config, "total_steps", config.num_updates >= 1, f"at least one update: >= {samples}"
-    )
+    _require(config, "total_steps", config.num_updates >= 1, f"at least one update: >= {samples}")
 
 
 def _require(config: TrainConfig, name: str, holds: bool, expected: str) -> None:

@@ -12,15 +12,14 @@ from flax import struct
 
 from jaxtrack.env import EnvState, SearchTrack
 from jaxtrack.params import Params
-from train.agents import Agent
+from train.agents import Agent, build_agent
 from train.config import TrainConfig
 from train.gae import advantages
 
 LOGGED = ("completeness", "covariance_norm_mean", "covariance_norm_sum", "live_tracks", "mean_scan_value")
 
 
-@struct.dataclass
-class LearnerState:
+class LearnerState(struct.PyTreeNode):
     """Everything that training carries from one update to the next, B environments.
 
     Attributes:
@@ -30,6 +29,7 @@ class LearnerState:
         inputs: network inputs of the current observations.
         episode_return: `[B]` reward summed since the episode began.
         episode_length: `[B]` steps since the episode began.
+        scenario: numbers of the environment; traced, so that changing them recompiles nothing.
         key: random key data.
         update: `[]` updates done.
     """
@@ -40,12 +40,12 @@ class LearnerState:
     inputs: Any
     episode_return: jax.Array
     episode_length: jax.Array
+    scenario: Params
     key: jax.Array
     update: jax.Array
 
 
-@struct.dataclass
-class Transition:
+class Transition(struct.PyTreeNode):
     """One step of B environments, as the update needs it (`[B, ...]`, stacked to `[S, B, ...]`)."""
 
     inputs: Any
@@ -58,8 +58,7 @@ class Transition:
     done: jax.Array
 
 
-@struct.dataclass
-class Sample:
+class Sample(struct.PyTreeNode):
     """What the loss reads of one step; leading dimensions are whatever the batch has."""
 
     inputs: Any
@@ -76,16 +75,17 @@ def make_optimiser(config: TrainConfig) -> optax.GradientTransformation:
     return optax.chain(optax.clip_by_global_norm(config.max_grad_norm), optax.adam(rate, eps=1e-5))
 
 
-def init_learner(key: jax.Array, env: SearchTrack, agent: Agent, config: TrainConfig) -> LearnerState:
+def init_learner(key: jax.Array, scenario: Params, env: SearchTrack, config: TrainConfig) -> LearnerState:
     """Fresh weights and environments.
 
     The environments start at different times of their episode, so that a rollout holds all
     phases of an episode and their ends do not fall on one step.
     """
+    agent = build_agent(config.encoder, env.static, scenario)
     key_env, key_net, key = jax.random.split(key, 3)
     keys = jax.random.split(key_env, config.num_envs)
-    observation, state = jax.vmap(env.reset_env, in_axes=(0, None))(keys, config.params)
-    phase = jnp.arange(config.num_envs) * config.params.max_steps_in_episode // config.num_envs
+    observation, state = jax.vmap(env.reset_env, in_axes=(0, None))(keys, scenario)
+    phase = jnp.arange(config.num_envs) * scenario.max_steps_in_episode // config.num_envs
     inputs = jax.vmap(agent.features)(observation)
     weights = agent.network.init(key_net, inputs)
     return LearnerState(
@@ -95,15 +95,17 @@ def init_learner(key: jax.Array, env: SearchTrack, agent: Agent, config: TrainCo
         inputs=inputs,
         episode_return=jnp.zeros(config.num_envs),
         episode_length=jnp.zeros(config.num_envs, dtype=int),
+        scenario=scenario,
         key=jax.random.key_data(key),
         update=jnp.asarray(0),
     )
 
 
 def train_step(
-    state: LearnerState, env: SearchTrack, agent: Agent, config: TrainConfig
+    state: LearnerState, env: SearchTrack, config: TrainConfig
 ) -> tuple[LearnerState, dict[str, jax.Array]]:
     """One update: a rollout of every environment, advantages, and PPO's epochs over them."""
+    agent = build_agent(config.encoder, env.static, state.scenario)
     key, key_rollout, key_update = jax.random.split(jax.random.wrap_key_data(state.key), 3)
     state, rollout, rollout_metrics = collect(key_rollout, state, env, agent, config)
     samples = estimate_advantages(rollout, state, agent, config)
@@ -122,12 +124,12 @@ def collect(
 
     def one_step(carry: LearnerState, key: jax.Array) -> tuple[LearnerState, tuple[Transition, Any]]:
         key_action, key_env = jax.random.split(key)
-        logits, value = agent.network.apply(carry.weights, carry.inputs)
+        logits, value = agent.evaluate(carry.weights, carry.inputs)
         action = agent.distribution.sample(key_action, logits)
         keys = jax.random.split(key_env, config.num_envs)
         observation, env_state, reward, terminated, truncated, info = jax.vmap(
             env.step, in_axes=(0, 0, 0, None)
-        )(keys, carry.env, action, config.params)
+        )(keys, carry.env, action, state.scenario)
         done = terminated | truncated
         transition = Transition(
             inputs=carry.inputs,
@@ -151,7 +153,7 @@ def collect(
 
     keys = jax.random.split(key, config.rollout_steps)
     state, (rollout, steps) = jax.lax.scan(one_step, state, keys)
-    return state, rollout, summarise(steps, config.params)
+    return state, rollout, summarise(steps, state.scenario)
 
 
 def value_at_end(weights: Any, final_observation: Any, done: jax.Array, agent: Agent) -> jax.Array:
@@ -161,7 +163,7 @@ def value_at_end(weights: Any, final_observation: Any, done: jax.Array, agent: A
     """
 
     def evaluate() -> jax.Array:
-        _, value = agent.network.apply(weights, jax.vmap(agent.features)(final_observation))
+        _, value = agent.evaluate(weights, jax.vmap(agent.features)(final_observation))
         return jnp.where(done, value, 0.0)
 
     return jax.lax.cond(jnp.any(done), evaluate, lambda: jnp.zeros(done.shape))
@@ -171,7 +173,7 @@ def estimate_advantages(
     rollout: Transition, state: LearnerState, agent: Agent, config: TrainConfig
 ) -> Sample:
     """Advantages of the rollout `[S, B]`, bootstrapped from the value after its last step."""
-    _, last_value = agent.network.apply(state.weights, state.inputs)
+    _, last_value = agent.evaluate(state.weights, state.inputs)
     following = jnp.concatenate([rollout.value[1:], last_value[None]])
     advantage = advantages(
         rollout.reward,
@@ -245,7 +247,7 @@ def ppo_loss(
     config: TrainConfig,
 ) -> tuple[jax.Array, dict[str, jax.Array]]:
     """Clipped surrogate, value error and entropy (Schulman et al. 2017, eq. 9)."""
-    logits, value = agent.network.apply(weights, samples.inputs)
+    logits, value = agent.evaluate(weights, samples.inputs)
     log_ratio = agent.distribution.log_prob(logits, samples.action) - samples.log_prob
     ratio = jnp.exp(log_ratio)
     clipped = jnp.clip(ratio, 1 - config.clip, 1 + config.clip)
