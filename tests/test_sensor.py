@@ -134,12 +134,13 @@ def test_detections_come_in_the_order_of_the_truths_then_clutter(truths_at, stat
     assert NO_TRUTH == NO_DETECTION == -1
 
 
-def test_noise_is_scaled_by_each_sigma_and_absent_truths_are_not_seen(truths_at, static, params):
+def test_noise_is_scaled_by_each_sigma_and_absent_truths_are_not_seen(truths_at, static):
+    params = Params(elevation_sigma=1e-3, bearing_sigma=4e-3, range_sigma=7.0)
     truths = truths_at([towards(0, 0, 3000)] * 3, alive=[True, False, True])
     noise = quiet(static, detection=[[1, 2, 3], [0, 0, 0], [-1, -2, -3]])
     detections, _ = detect(truths, AHEAD, noise, static, params)
     np.testing.assert_array_equal(detections.truth, [0, 2, NO_TRUTH, NO_TRUTH])
-    expected = [[2e-3, 4e-3, 3015], [-2e-3, -4e-3, 2985]]
+    expected = [[1e-3, 8e-3, 3021], [-1e-3, -8e-3, 2979]]
     np.testing.assert_allclose(detections.value[:2], expected, rtol=1e-5, atol=1e-7)
 
 
