@@ -18,6 +18,10 @@ from jaxtrack.sensor import in_beam
 CELL_FEATURES = 5
 CONTEXT_FEATURES = 3
 
+LOGIT_SCALE = 10.0
+"""Good looks differ from poor ones by a few hundredths of a scan value: small weights must
+be able to tell them apart by several nats, or the policy stays almost uniform."""
+
 
 class CellInputs(struct.PyTreeNode):
     """What the per-cell network reads, K = L * L cells.
@@ -86,7 +90,7 @@ class CellNetwork(nn.Module):
         hidden = nn.relu(hidden + context[..., None, :])
         hidden = nn.relu(nn.Dense(self.width, kernel_init=gain, name="hidden")(hidden))
         small = nn.initializers.orthogonal(0.01)
-        logits = nn.Dense(1, kernel_init=small, name="logit")(hidden)[..., 0]
+        logits = LOGIT_SCALE * nn.Dense(1, kernel_init=small, name="logit")(hidden)[..., 0]
         pooled = jnp.concatenate([hidden.mean(axis=-2), hidden.max(axis=-2), inputs.context], axis=-1)
         pooled = nn.relu(nn.Dense(2 * self.width, kernel_init=gain, name="pooled")(pooled))
         value = nn.Dense(1, kernel_init=nn.initializers.orthogonal(1.0), name="value")(pooled)

@@ -86,7 +86,8 @@ def init_learner(key: jax.Array, scenario: Params, env: SearchTrack, config: Tra
     keys = jax.random.split(key_env, config.num_envs)
     observation, state = jax.vmap(env.reset_env, in_axes=(0, None))(keys, scenario)
     phase = jnp.arange(config.num_envs) * scenario.max_steps_in_episode // config.num_envs
-    inputs = jax.vmap(agent.features)(observation)
+    # The first observations are constants: unhidden, the compiler would spend seconds on folding them.
+    inputs = jax.vmap(agent.features)(jax.lax.optimization_barrier(observation))
     weights = agent.network.init(key_net, inputs)
     return LearnerState(
         weights=weights,

@@ -126,6 +126,7 @@ def train(
         task = progress.add_task("training", total=config.num_updates * config.batch_size, note="")
         for update in range(config.num_updates):
             state, metrics = compiled(state)
+            metrics = jax.device_get(metrics)
             row = make_row(metrics, update + 1, time.perf_counter() - started, config)
             lost = next((name for name in HEALTH if not math.isfinite(row[name])), None)
             if lost:

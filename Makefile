@@ -1,0 +1,49 @@
+# Two commands: `make train` trains and evaluates an agent, `make test` checks everything.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+STAMP := $(VENV)/.installed
+ARGS ?=
+
+export JAX_PLATFORMS ?= cpu
+
+.PHONY: help setup train test slow lint bench clean
+
+help:
+	@echo "make train   train an agent, compare it with the baselines, draw pictures (runs/)"
+	@echo "make test    lint, types and all quick tests"
+	@echo "make slow    the tests that take longer"
+	@echo "make lint    ruff and mypy only"
+	@echo "make bench   throughput of our environment beside Stone Soup's"
+	@echo "make setup   .venv with everything the above need"
+	@echo "ARGS=... is handed on, for example: make train ARGS='--encoder mhsa --seed 1'"
+
+setup: $(STAMP)
+
+$(STAMP): pyproject.toml
+	@$(PYTHON) -c 'import sys; sys.exit("Python 3.11 or newer is needed: make PYTHON=python3.11 ..." if sys.version_info < (3, 11) else 0)'
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/pip install --quiet --editable ".[reference,dev]"
+	@touch $(STAMP)
+
+train: setup
+	@started=$$(date +%s); $(BIN)/python -m train.ppo $(ARGS) && \
+	echo "make train took $$(( $$(date +%s) - started )) s"
+
+test: setup
+	@started=$$(date +%s); $(MAKE) --no-print-directory lint && $(BIN)/pytest -n auto $(ARGS) && \
+	echo "make test took $$(( $$(date +%s) - started )) s"
+
+slow: setup
+	$(BIN)/pytest -m slow $(ARGS)
+
+lint: setup
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+bench: setup
+	$(BIN)/python -m benchmarks.environment $(ARGS)
+
+clean:
+	rm -rf $(VENV) build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
