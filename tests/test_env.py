@@ -133,7 +133,9 @@ def test_info_is_scalar_finite_and_adds_up(episode):
         np.testing.assert_allclose(reward, info["reward_track"] + info["reward_search"], rtol=1e-6)
         assert int(info["live_tracks"]) == int(state.tracks.active.sum())
         np.testing.assert_allclose(info["mean_scan_value"], state.scan_map.mean(), rtol=1e-6)
-        initiated += int(jnp.sum(state.tracks.active & (state.tracks.age == 0)))
+        newborn = state.tracks.active & (state.tracks.age == 0)
+        assert bool(jnp.all(state.tracks.birth_step[newborn] == state.time))
+        initiated += int(jnp.sum(newborn))
         assert int(state.num_initiated) == initiated
     assert sum(int(info["num_detections"]) for *_, info in episode[1]) > 5
 

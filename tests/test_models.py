@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
 
 from jaxtrack import models
 
@@ -14,6 +15,8 @@ angles = st.floats(-20.0, 20.0)
 wrap_bearing = jax.jit(models.wrap_bearing)
 fold_elevation = jax.jit(models.fold_elevation)
 measure = jax.jit(models.elevation_bearing_range)
+measure_points = jax.jit(models.spherical)
+spherical_offsets = jax.jit(models.spherical_offsets)
 locate = jax.jit(models.inverse_elevation_bearing_range)
 inverse_jacobian = jax.jit(models.inverse_jacobian)
 
@@ -119,3 +122,25 @@ def test_the_inverse_jacobian_inverts_the_jacobian_of_the_measurement(x64):
     detection = jnp.array([0.4, -0.9, 2500.0])
     forward = jax.jacfwd(models.spherical)(locate(detection))
     np.testing.assert_allclose(forward @ inverse_jacobian(detection), np.eye(3), atol=1e-12)
+
+
+@given(
+    hnp.arrays(float, 3, elements=st.floats(-3000, 3000)),
+    hnp.arrays(float, (4, 3), elements=st.floats(-500, 500)),
+)
+def test_offsets_are_the_differences_of_two_measurements(x64, centre, displacement):
+    centre = centre + np.array([2000.0, 0, 0]) * np.sign(centre[0] + 0.5)
+    sine, cosine, range_change = spherical_offsets(centre, displacement)
+    change = measure_points(centre + displacement) - measure_points(centre)
+    np.testing.assert_allclose(sine, np.sin(change[:, :2]), atol=1e-11)
+    np.testing.assert_allclose(cosine, np.cos(change[:, :2]), atol=1e-11)
+    np.testing.assert_allclose(range_change, change[:, 2], atol=1e-8)
+
+
+def test_offsets_do_not_cancel_in_single_precision():
+    # A centimetre at five kilometres is 2 microradians, below the spacing of angles near 1 rad.
+    centre, displacement = np.array([3000.0, 4000.0, 0.0]), np.array([[-0.008, 0.006, 0.01]])
+    sine, _, range_change = spherical_offsets(jnp.asarray(centre), jnp.asarray(displacement))
+    np.testing.assert_allclose(sine, [[2e-6, 2e-6]], rtol=1e-3)
+    # |d|^2 / (2 r): the displacement is square to the line of sight.
+    np.testing.assert_allclose(range_change, [2e-8], atol=2e-9)
