@@ -100,6 +100,6 @@ def run(command: Callable[[Sequence[str]], int]) -> None:
 def _one_line(box: str) -> str:
     """The words of tyro's error box, without its frame and its pointer to --help."""
     words = re.sub(r"\x1b\[[0-9;]*m", "", box)
-    words = re.sub(r"[─│╭╮╰╯━┃┏┓┗┛-]{2,}|[│╭╮╰╯]", " ", words)
+    words = re.sub(r"[─━┃┏┓┗┛│╭╮╰╯]|-{3,}", " ", words)
     words = re.sub(r"For full helptext.*", "", " ".join(words.split()))
     return words.strip()
