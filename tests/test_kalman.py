@@ -154,8 +154,8 @@ def test_tracks_without_a_detection_keep_their_prediction(tracks_at, params, x64
 def test_an_innovation_across_the_rear_is_small(tracks_at, params, x64):
     # The track lies at bearing pi - 0.001, the detection at -pi + 0.001: 0.002 further left.
     behind = [3000 * np.cos(np.pi - 0.001), 0, 3000 * np.sin(np.pi - 0.001), 0, 0, 0]
-    detections = Detections.from_values([[0.0, -np.pi + 0.001, 3000.0]])
-    expected, updated = filter_once(tracks_at(behind, 1), detections, jnp.array([0]), params)
+    detections = Detections.from_values([[0.0, -np.pi + 0.001, 3000.0]] * 3)
+    expected, updated = filter_once(tracks_at([behind] * 3, 3), detections, jnp.arange(3), params)
     np.testing.assert_allclose(expected.mean[0, 1], np.pi - 0.001, atol=1e-6)
     # Both variances are (10 m / 3000 m)^2 and (2 mrad)^2: the gain is 0.735, the way 6 m.
     gain = (1 / 300) ** 2 / ((1 / 300) ** 2 + 0.002**2)
