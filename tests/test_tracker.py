@@ -100,12 +100,6 @@ def test_an_empty_look_is_only_a_prediction(tracks, detections, params):
     np.testing.assert_array_equal(after.updated_by, [NO_DETECTION] * 5)
 
 
-def test_from_nothing_every_detection_becomes_a_track(detections, params):
-    after, _ = step(Tracks.empty(5), detections, DT, STEP, params)
-    np.testing.assert_array_equal(after.active, [True, True, True, False, False])
-    np.testing.assert_array_equal(after.birth_detection[:3], [0, 1, 2])
-
-
 def test_a_newborn_survives_its_first_step_however_uncertain(detections):
     params = Params(deletion_threshold=100.0)  # three velocity variances alone are 2700
     born, _ = step(Tracks.empty(5), detections, DT, STEP, params)
