@@ -56,9 +56,7 @@ def associate_nearest_neighbour(admissible: jax.Array) -> jax.Array:
         nearest = jnp.argmin(left)
         is_track = jnp.arange(num_tracks) == nearest // num_detections
         is_detection = jnp.arange(num_detections) == nearest % num_detections
-        # Under vmap this also runs where nothing is left: it must then change nothing.
-        take = jnp.isfinite(left[nearest // num_detections, nearest % num_detections])
-        associated = jnp.where(is_track & take, nearest % num_detections, associated)
+        associated = jnp.where(is_track, nearest % num_detections, associated)
         removed = is_track[:, None] | is_detection[None]
         return jnp.where(removed, jnp.inf, left), associated
 

@@ -168,7 +168,8 @@ def check_trajectories(static: StaticParams, params: Params) -> None:
 def _check_quantity(field: dataclasses.Field, value: Any) -> None:
     low, high = field.metadata["low"], field.metadata["high"]
     bracket = "(" if field.metadata["open_low"] else "["
-    expected = f"expected a number in {bracket}{low:g}, {high:g}] {field.metadata['unit']}"
+    end = ")" if math.isinf(high) else "]"
+    expected = f"expected a number in {bracket}{low:g}, {high:g}{end} {field.metadata['unit']}"
     try:
         numbers = np.asarray(value, dtype=float)
     except (TypeError, ValueError):

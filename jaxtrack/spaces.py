@@ -1,13 +1,25 @@
-"""Spaces that gymnax 1.0.1 lacks: arrays of indices, and dictionaries that are dictionaries."""
+"""Spaces that gymnax 1.0.1 lacks: index arrays, boxes without bounds, dictionaries of observations."""
 
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from gymnax.environments import spaces
-from gymnax.environments.spaces import Box
 
 __all__ = ["Box", "Dict", "Indices"]
+
+
+class Box(spaces.Box):
+    """gymnax's `Box` draws NaN where it has no bounds, and only True where it is boolean."""
+
+    def sample(self, key: jax.Array) -> jax.Array:
+        """Standard normal without bounds, a fair coin for booleans, else uniform."""
+        if np.isinf(self.low) or np.isinf(self.high):
+            return jax.random.normal(key, self.shape, self.dtype)
+        if self.dtype == jnp.bool_:
+            return jax.random.bernoulli(key, shape=self.shape)
+        return super().sample(key)
 
 
 class Indices(spaces.Space):
@@ -24,8 +36,9 @@ class Indices(spaces.Space):
         return jax.random.randint(key, self.shape, 0, self.count, self.dtype)
 
     def contains(self, x: jax.Array) -> jax.Array:
-        """Whether every entry of `x` is an index."""
-        return jnp.all((x >= 0) & (x < self.count))
+        """Whether `x` has this shape and every entry is an index."""
+        whole = jnp.issubdtype(jnp.asarray(x).dtype, jnp.integer) and jnp.shape(x) == self.shape
+        return jnp.all((x >= 0) & (x < self.count)) & whole
 
 
 class Dict(spaces.Dict):

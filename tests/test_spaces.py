@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxtrack import make
 from jaxtrack.spaces import Box, Dict, Indices
 
 KEYS = jax.random.split(jax.random.key(0), 500)
@@ -49,3 +50,19 @@ def test_a_dictionary_needs_its_keys_shapes_and_ranges(value, inside):
     space = Dict({"a": Box(0.0, 1.0, (2,)), "b": Box(0.0, 1.0, ())})
     assert bool(space.contains(value)) == inside
     assert bool(jax.jit(space.contains)(value)) == inside
+
+
+@pytest.mark.parametrize(
+    ("action", "inside"), [([0.0, 1.0], False), ([0, 1, 2], False), ([2, 2], True), ([[0, 1]], False)]
+)
+def test_indices_contain_integers_of_their_shape_only(action, inside):
+    assert bool(Indices(3, (2,)).contains(jnp.array(action))) == inside
+
+
+def test_a_sample_of_the_observation_space_lies_in_it():
+    env, params = make()
+    space = env.observation_space(params)
+    sample = jax.jit(space.sample)(jax.random.key(0))
+    assert bool(space.contains(sample))
+    assert bool(jnp.all(jnp.isfinite(sample["tracks"])))
+    assert set(np.unique(sample["mask"])) == {False, True}
