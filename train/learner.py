@@ -71,7 +71,7 @@ class Sample(struct.PyTreeNode):
 def make_optimiser(config: TrainConfig) -> optax.GradientTransformation:
     """Adam on gradients clipped by their global norm, with the learning rate annealed to zero."""
     steps = config.num_updates * config.epochs * config.num_minibatches
-    rate = optax.linear_schedule(config.learning_rate, 0.0, steps) if config.anneal else config.learning_rate
+    rate = optax.linear_schedule(config.initial_rate, 0.0, steps) if config.anneal else config.initial_rate
     return optax.chain(optax.clip_by_global_norm(config.max_grad_norm), optax.adam(rate, eps=1e-5))
 
 
@@ -200,7 +200,7 @@ def update_epochs(
         minibatch = jax.tree.map(lambda leaf: leaf[rows], flat)
         grads, losses = minibatch_gradient(weights, minibatch, agent, config)
         updates, optimiser_state = optimiser.update(grads, optimiser_state, weights)
-        losses["gradient_norm"] = optax.global_norm(grads)
+        losses["gradient_norm"] = optax.tree.norm(grads)
         return (optax.apply_updates(weights, updates), optimiser_state), losses
 
     def one_epoch(carry: tuple[Any, Any], key: jax.Array) -> tuple[tuple[Any, Any], Any]:
