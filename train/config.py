@@ -8,7 +8,6 @@ from typing import Any, get_args
 from jaxtrack.params import Params, StaticParams, validate
 from train.agents import AGENTS
 
-
 LEARNING_RATES = {"cells": 1e-2, "paper": 1e-3}
 """The per-cell network is small and its inputs are few: it bears ten times the usual rate."""
 
