@@ -5,6 +5,7 @@ import json
 import sys
 import time
 from collections.abc import Sequence
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -61,6 +62,8 @@ def check(options: EnvironmentOptions, static: StaticParams, params: Params) -> 
     for name, value in counts.items():
         if value < 1:
             raise ValueError(f"{name} = {value}: expected an integer >= 1")
+    if len(set(options.num_envs)) < len(options.num_envs):
+        raise ValueError(f"num_envs = {options.num_envs}: expected different numbers")
     if options.seed < 0:
         raise ValueError(f"seed = {options.seed}: expected an integer >= 0")
     left = params.max_steps_in_episode - static.num_looks**2 - 1
@@ -116,14 +119,14 @@ def measure(
         One row for each policy and number of environments.
     """
     env, params = make(params, static)
-    cases = [(policy, count) for policy in POLICIES for count in options.num_envs]
+    cases = list(product(POLICIES, options.num_envs))
     task = progress.add_task("compiling", total=len(cases) + len(POLICIES) * options.repeats)
     find_tracks = jax.jit(lambda key, params: raster(key, params, env, max(options.num_envs)))
-    key = jax.random.key(options.seed)
-    start = find_tracks(key, params)
+    keys = jax.random.split(jax.random.key(options.seed), (options.repeats, 2))
+    starts = [find_tracks(key, params) for key in keys[:, 0]]
     plays, compile_seconds = {}, {}
     for policy, count in cases:
-        build, few = POLICIES[policy][0], first(count, start)
+        build, few = POLICIES[policy][0], first(count, starts[0])
         plays[policy, count], seconds = compile_play(env, params, few, build, options.steps)
         compile_seconds[policy, count] = seconds
         progress.advance(task)
@@ -131,15 +134,13 @@ def measure(
     progress.update(task, description="measuring")
     ours: dict[tuple[str, int], list[Timing]] = {case: [] for case in cases}
     theirs: dict[str, list[Timing]] = {policy: [] for policy in POLICIES}
-    rounds = [(repeat, policy) for repeat in range(options.repeats) for policy in POLICIES]
-    for repeat, policy in rounds:
-        key_start, key_play = jax.random.split(jax.random.fold_in(key, repeat))
-        start = jax.block_until_ready(find_tracks(key_start, params))
+    for repeat, policy in product(range(options.repeats), POLICIES):
         seed, look = options.seed + repeat, POLICIES[policy][1]
         theirs[policy].append(time_stone_soup(look, static, params, options.stone_soup_steps, seed))
         for count in options.num_envs:
-            few = first(count, start)
-            ours[policy, count].append(time_ours(plays[policy, count], key_play, few, params, options))
+            few = first(count, starts[repeat])
+            timing = time_ours(plays[policy, count], keys[repeat, 1], few, params, options)
+            ours[policy, count].append(timing)
         progress.advance(task)
     return [make_row(case, ours[case], theirs[case[0]], compile_seconds[case]) for case in cases]
 

@@ -126,6 +126,7 @@ def test_command_writes_all_and_prints_markdown(rows, tmp_path, monkeypatch, cap
     [
         (["--repeats", "0"], "repeats = 0"),
         (["--num-envs", "1", "0"], "num_envs = 0"),
+        (["--num-envs", "4", "4"], r"num_envs = \(4, 4\): expected different"),
         (["--stone-soup-steps", "639"], "stone_soup_steps = 639: expected at most 638"),
         (["--seed", "-1"], "seed = -1"),
         (["--out", "no/such/folder/x.json"], "out = "),
