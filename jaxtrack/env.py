@@ -1,5 +1,6 @@
 """The environment `SearchTrack-v0` in gymnax form. It holds no mathematics of its own."""
 
+import dataclasses
 from typing import Any
 
 import gymnax
@@ -191,15 +192,29 @@ def step_info(
 
 
 def make(
-    params: Params | None = None, static: StaticParams | None = None, **shapes: Any
+    params: Params | None = None, static: StaticParams | None = None, **fields: Any
 ) -> tuple[SearchTrack, Params]:
     """The environment and its parameters, both checked.
 
+    Args:
+        params: numbers; the paper's scenario by default.
+        static: shapes; the paper's by default.
+        **fields: any field of `Params` or `StaticParams`, to change just that.
+
     Raises:
-        ValueError: naming the wrong field and its range.
+        ValueError: naming the wrong field and its range, or a field that does not exist.
     """
-    env = SearchTrack(static, **shapes)
-    params = env.default_params if params is None else params
+    numbers = {field.name for field in dataclasses.fields(Params)}
+    shapes = {field.name for field in dataclasses.fields(StaticParams)}
+    unknown = sorted(set(fields) - numbers - shapes)
+    if unknown:
+        raise ValueError(
+            f"{unknown[0]}: no such field; expected one of {', '.join(sorted(numbers | shapes))}"
+        )
+    params = dataclasses.replace(
+        params or Params(), **{name: value for name, value in fields.items() if name in numbers}
+    )
+    env = SearchTrack(static, **{name: value for name, value in fields.items() if name in shapes})
     validate(env.static, params)
     return env, params
 

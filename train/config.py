@@ -7,6 +7,8 @@ from typing import Any, get_args
 
 from jaxtrack.params import Params, StaticParams, validate
 from train.agents import AGENTS
+from train.networks import ENCODERS
+from train.vision import SMALLEST_MAP
 
 LEARNING_RATES = {"cells": 1e-2, "paper": 1e-3}
 """The per-cell network is small and its inputs are few: it bears ten times the usual rate."""
@@ -113,6 +115,10 @@ def check(config: TrainConfig) -> None:
     for name in _NOT_NEGATIVE:
         _require(config, name, 0 <= getattr(config, name) < math.inf, "a number >= 0")
     _check_batches(config)
+    if config.encoder in ENCODERS and config.static.map_size < SMALLEST_MAP:
+        raise ValueError(
+            f"static.map_size = {config.static.map_size}: expected an integer >= {SMALLEST_MAP} for NatureCNN"
+        )
     if config.static.continuous_actions:
         raise ValueError("static.continuous_actions = True: expected False, the agents choose discrete looks")
     validate(config.static, config.params)

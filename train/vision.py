@@ -13,8 +13,12 @@ GAIN = 2**0.5
 """Gain of the orthogonal initialisation of every layer but the heads (as in SB3)."""
 
 
+SMALLEST_MAP = 36
+"""Pixels along a side that leave one output to the last convolution."""
+
+
 class NatureCNN(nn.Module):
-    """Scan maps `[B, M, M]` in [0, 1] to latents z_SH `[B, features]`, M at least 36.
+    """Scan maps `[B, M, M]` in [0, 1] to latents z_SH `[B, features]`, M at least `SMALLEST_MAP`.
 
     Convolutions 8x8 stride 4, 4x4 stride 2 and 3x3 stride 1 without padding, then a dense
     layer; a ReLU after each.

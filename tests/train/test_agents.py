@@ -1,0 +1,100 @@
+"""Agents by name, and trained agents in the form of the baselines."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxtrack import Params, StaticParams
+from jaxtrack.env import SearchTrack
+from jaxtrack.observation import observe
+from train.agents import AGENTS, Agent, agent_policy, build_agent
+from train.cells import CellGeometry, CellNetwork
+from train.distributions import FACTORED, JOINT
+
+STATIC = StaticParams(num_truths=2, max_tracks=3, map_size=36, num_looks=4)
+PARAMS = Params()
+
+
+def shapes(agent):
+    """Shapes of logits and value for a batch of two observations."""
+    observation = {
+        "tracks": jnp.zeros((2, 3, 7)),
+        "mask": jnp.zeros((2, 3), dtype=bool),
+        "scan_map": jnp.zeros((2, 36, 36)),
+    }
+
+    def evaluate(key):
+        inputs = jax.vmap(agent.features)(observation)
+        return agent.evaluate(agent.network.init(key, inputs), inputs)
+
+    return [leaf.shape for leaf in jax.eval_shape(evaluate, jax.random.key(0))]
+
+
+def test_the_agents_are_the_per_cell_one_and_the_papers_three():
+    assert AGENTS == ("cells", "flatten", "bigru", "mhsa")
+
+
+def test_cells_have_one_logit_per_look():
+    agent = build_agent("cells", STATIC, PARAMS)
+    assert isinstance(agent.network, CellNetwork)
+    assert agent.distribution is JOINT
+    assert shapes(agent) == [(2, 16), (2,)]
+
+
+@pytest.mark.parametrize("name", ["flatten", "bigru", "mhsa"])
+def test_the_papers_networks_have_one_logit_per_index(name):
+    agent = build_agent(name, STATIC, PARAMS)
+    assert agent.network.encoder == name
+    assert agent.distribution is FACTORED
+    assert shapes(agent) == [(2, 2, 4), (2,)]
+
+
+def test_an_unknown_name_is_refused():
+    with pytest.raises(ValueError, match=r"^encoder = 'cnn': expected one of cells, flatten, bigru, mhsa$"):
+        build_agent("cnn", STATIC, PARAMS)
+
+
+@pytest.fixture(scope="module")
+def state():
+    """The state after a reset, on a map that differs from place to place."""
+    _, start = SearchTrack(STATIC).reset_env(jax.random.key(0), PARAMS)
+    return start.replace(scan_map=jnp.linspace(0, 1, 36 * 36).reshape(36, 36))
+
+
+@pytest.fixture(scope="module")
+def weights(state, draw_variables):
+    """Random weights of the per-cell network."""
+    inputs = CellGeometry(STATIC, PARAMS)(observe(state.tracks, state.scan_map, PARAMS))
+    return draw_variables(CellNetwork(), inputs)
+
+
+def test_greedy_takes_the_most_probable_look(state, weights):
+    agent: Agent = build_agent("cells", STATIC, PARAMS)
+    logits, _ = agent.evaluate(weights, agent.features(observe(state.tracks, state.scan_map, PARAMS)))
+    greedy = jax.jit(agent_policy("cells", weights, greedy=True)(STATIC, PARAMS))
+    for seed in range(3):
+        action = greedy(jax.random.key(seed), state)
+        np.testing.assert_array_equal(action, np.unravel_index(np.argmax(logits), (4, 4)))
+
+
+def test_samples_follow_from_the_key_and_the_time(state, weights):
+    policy = agent_policy("cells", weights)(STATIC, PARAMS)
+
+    @jax.jit
+    def act(seeds, times):
+        return jax.vmap(lambda seed, time: policy(jax.random.key(seed), state.replace(time=time)))(
+            seeds, times
+        )
+
+    counts, same = np.arange(400), np.zeros(400, dtype=int)
+    over_time, over_keys = np.asarray(act(same, counts)), np.asarray(act(counts, same))
+    np.testing.assert_array_equal(act(same, counts), over_time)
+    np.testing.assert_array_equal(act(same, same), np.broadcast_to(over_time[0], (400, 2)))
+    agent = build_agent("cells", STATIC, PARAMS)
+    logits, _ = agent.evaluate(weights, agent.features(observe(state.tracks, state.scan_map, PARAMS)))
+    expected = np.asarray(jax.nn.softmax(logits))
+    for actions in (over_time, over_keys):
+        share = np.bincount(actions[:, 0] * 4 + actions[:, 1], minlength=16) / 400
+        # Four standard deviations of a share p of 400 draws.
+        assert (np.abs(share - expected) <= 4 * np.sqrt(expected * (1 - expected) / 400) + 1e-3).all()

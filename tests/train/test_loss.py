@@ -1,0 +1,149 @@
+"""The loss, its gradient in pieces and the optimiser, by hand arithmetic."""
+
+import dataclasses
+import math
+from types import SimpleNamespace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from train import learner
+from train.agents import Agent
+from train.cells import CellInputs, CellNetwork
+from train.config import TrainConfig
+from train.distributions import JOINT
+
+BASE = TrainConfig(
+    num_envs=8, rollout_steps=8, num_minibatches=2, microbatch=16, learning_rate=0.03, anneal=False
+)
+
+# An agent whose weights are its outputs: the loss can be done by hand.
+BARE = Agent(
+    lambda observation: observation,
+    SimpleNamespace(
+        apply=lambda weights, inputs: (
+            jnp.broadcast_to(weights["logits"], (len(inputs), 4)),
+            jnp.broadcast_to(weights["value"], (len(inputs),)),
+        )
+    ),
+    JOINT,
+)
+# Look (0, 0) has probability 1/2, the others 1/6.
+WEIGHTS = {"logits": jnp.log(jnp.array([3.0, 1.0, 1.0, 1.0])), "value": jnp.array(2.0)}
+
+
+def loss_of(old_probability, advantage, config):
+    """Loss, parts and gradient for one sample of look (0, 0) whose target is 5."""
+    sample = learner.Sample(
+        inputs=jnp.zeros((1, 1)),
+        action=jnp.zeros((1, 2), dtype=int),
+        log_prob=jnp.log(jnp.array([old_probability])),
+        value=jnp.zeros(1),
+        advantage=jnp.zeros(1),
+    )
+    loss = jax.value_and_grad(learner.ppo_loss, has_aux=True)
+    return loss(WEIGHTS, sample, jnp.array([advantage]), jnp.array([5.0]), BARE, config)
+
+
+@pytest.mark.parametrize(
+    ("old_probability", "advantage", "policy_loss", "clipped"),
+    [
+        # Ratio 1/2 / 1/4 = 2 is clipped to 1.2 where that is the smaller gain.
+        (0.25, 1.0, -1.2, True),
+        (0.25, -1.0, 2.0, False),
+        # Ratio 1/2 / 1 = 0.5, clipped to 0.8.
+        (1.0, -1.0, 0.8, True),
+        (1.0, 1.0, -0.5, False),
+        (0.5, 3.0, -3.0, False),
+    ],
+)
+def test_the_surrogate_is_clipped_on_the_side_that_gains(old_probability, advantage, policy_loss, clipped):
+    config = dataclasses.replace(BASE, value_coefficient=0.0, entropy_coefficient=0.0)
+    (loss, parts), gradient = loss_of(old_probability, advantage, config)
+    np.testing.assert_allclose([loss, parts["policy_loss"]], policy_loss, rtol=1e-5)
+    assert parts["clip_fraction"] == (old_probability != 0.5)
+    assert (np.abs(gradient["logits"]).max() < 1e-6) == clipped
+
+
+def test_value_error_entropy_and_divergence_by_hand():
+    config = dataclasses.replace(BASE, value_coefficient=0.5, entropy_coefficient=0.1)
+    (loss, parts), gradient = loss_of(0.25, 1.0, config)
+    # Half the squared error of 2 against 5; entropy (1/2) ln 2 + 3 (1/6) ln 6; ratio 2.
+    entropy = 0.5 * math.log(2) + 0.5 * math.log(6)
+    np.testing.assert_allclose(parts["value_loss"], 4.5, rtol=1e-6)
+    np.testing.assert_allclose(parts["entropy"], entropy, rtol=1e-6)
+    np.testing.assert_allclose(parts["approximate_kl"], 1 - math.log(2), rtol=1e-5)
+    np.testing.assert_allclose(loss, -1.2 + 0.5 * 4.5 - 0.1 * entropy, rtol=1e-5)
+    np.testing.assert_allclose(gradient["value"], 0.5 * (2 - 5), rtol=1e-6)
+
+
+def random_samples(count):
+    """Samples as a rollout on four looks gives them."""
+    rng = np.random.default_rng(0)
+    return learner.Sample(
+        inputs=CellInputs(
+            cells=jnp.asarray(rng.uniform(size=(count, 4, 5)), dtype=float),
+            context=jnp.asarray(rng.uniform(size=(count, 3)), dtype=float),
+        ),
+        action=jnp.asarray(rng.integers(0, 2, (count, 2))),
+        log_prob=jnp.asarray(rng.normal(-1.4, 0.2, count), dtype=float),
+        value=jnp.asarray(rng.normal(size=count), dtype=float),
+        advantage=jnp.asarray(rng.normal(3, 2, count), dtype=float),
+    )
+
+
+def test_the_microbatch_changes_nothing(draw_variables):
+    samples = random_samples(16)
+    network = CellNetwork(width=4)
+    weights = draw_variables(network, samples.inputs)
+    agent = Agent(lambda observation: observation, network, JOINT)
+    config = dataclasses.replace(BASE, rollout_steps=4, num_minibatches=2, entropy_coefficient=0.1)
+    assert config.minibatch_size == 16
+
+    @jax.jit
+    def gradients(weights):
+        in_pieces = [
+            learner.minibatch_gradient(weights, samples, agent, dataclasses.replace(config, microbatch=size))
+            for size in (16, 4)
+        ]
+        # The loss over the whole minibatch, its advantages normalised.
+        advantage = samples.advantage
+        normalised = (advantage - advantage.mean()) / advantage.std()
+        whole = jax.grad(learner.ppo_loss, has_aux=True)(
+            weights, samples, normalised, samples.value + advantage, agent, config
+        )
+        return [*in_pieces, whole]
+
+    one_piece, four_pieces, whole = gradients(weights)
+    for result in (one_piece, four_pieces):
+        jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, rtol=1e-4, atol=1e-6), result, whole)
+
+
+def test_the_learning_rate_falls_to_zero_over_all_updates():
+    config = dataclasses.replace(BASE, anneal=True, total_steps=2 * BASE.batch_size, max_grad_norm=1e9)
+    optimiser = learner.make_optimiser(config)
+    state, sizes = optimiser.init(jnp.zeros(())), []
+    # Two updates of four epochs of two minibatches; Adam's step on a constant gradient is its rate.
+    for _ in range(17):
+        step, state = optimiser.update(jnp.ones(()), state, jnp.zeros(()))
+        sizes.append(-float(step))
+    np.testing.assert_allclose(sizes, 0.03 * (1 - np.arange(17) / 16), atol=1e-5)
+
+
+def test_gradients_are_scaled_down_to_the_largest_norm():
+    config = dataclasses.replace(BASE, max_grad_norm=0.5)
+    optimiser = learner.make_optimiser(config)
+    gradient = jnp.array([3.0, 4.0])
+    _, state = optimiser.update(gradient, optimiser.init(gradient), gradient)
+    # Adam's first moment is a tenth of the gradient it got: (3, 4) at norm 0.5.
+    moment = jax.tree.leaves(state)[1]
+    np.testing.assert_allclose(moment, [0.03, 0.04], rtol=1e-5)
+
+
+def test_explained_variance():
+    value, advantage = jnp.array([1.0, 2.0, 3.0]), jnp.zeros(3)
+    assert learner.explained_variance(value, advantage) == 1
+    # Values that say nothing explain nothing.
+    np.testing.assert_allclose(learner.explained_variance(jnp.zeros(3), value), 0.0, atol=1e-6)
