@@ -30,6 +30,15 @@ def x64():
     jax.config.update("jax_enable_x64", before)
 
 
+@pytest.fixture(scope="module")
+def quick_compilation():
+    """Compiles without optimising, for programs that run for milliseconds."""
+    before = jax.config.read("jax_disable_most_optimizations")
+    jax.config.update("jax_disable_most_optimizations", True)
+    yield
+    jax.config.update("jax_disable_most_optimizations", before)
+
+
 @pytest.fixture(scope="session")
 def static():
     """Shapes small enough to compile quickly, all different so that none is mistaken for another."""

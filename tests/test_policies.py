@@ -12,6 +12,8 @@ from jaxtrack.env import EnvState, SearchTrack
 from jaxtrack.policies import POLICIES, REVISIT_SHARE
 from jaxtrack.sensor import look_angles
 
+pytestmark = pytest.mark.usefixtures("quick_compilation")
+
 L, M, T = 5, 16, 4
 STATIC = StaticParams(num_truths=3, max_tracks=T, map_size=M, num_looks=L)
 CONTINUOUS = StaticParams(num_truths=3, max_tracks=T, map_size=M, num_looks=L, continuous_actions=True)

@@ -12,6 +12,8 @@ from train.agents import AGENTS, Agent, agent_policy, build_agent
 from train.cells import CellGeometry, CellNetwork
 from train.distributions import FACTORED, JOINT
 
+pytestmark = pytest.mark.usefixtures("quick_compilation")
+
 STATIC = StaticParams(num_truths=2, max_tracks=3, map_size=36, num_looks=4)
 PARAMS = Params()
 

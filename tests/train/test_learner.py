@@ -1,4 +1,4 @@
-"""The learner on tiny environments of which everything is known (probes, as in rejax)."""
+"""The learner on tiny environments of which everything is known (probes)."""
 
 import dataclasses
 import math
@@ -7,84 +7,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from flax import linen as nn
-from flax import struct
 
 from jaxtrack import Params
+from tests.train.probes import Linear, Probe, ProbeState, at_the_end, constant, right_look
 from train import learner
 from train.agents import Agent
 from train.config import TrainConfig
 from train.distributions import JOINT
 
-LOOKS = 2
-
-
-@pytest.fixture(autouse=True)
-def quick_compilation():
-    """Programs that run for milliseconds are not worth seconds of optimisation."""
-    before = jax.config.read("jax_disable_most_optimizations")
-    jax.config.update("jax_disable_most_optimizations", True)
-    yield
-    jax.config.update("jax_disable_most_optimizations", before)
-
-
-class ProbeState(struct.PyTreeNode):
-    """Steps since the start, and a coin that the observation shows."""
-
-    time: jax.Array
-    coin: jax.Array
-
-
-class Probe:
-    """Reward is a function of (time, coin, action); the observation is time and coin, one-hot."""
-
-    static = None
-
-    def __init__(self, reward, length, terminates=False):
-        self.reward, self.length, self.terminates = reward, length, terminates
-
-    def observe(self, state):
-        return jnp.concatenate([jax.nn.one_hot(state.time, self.length + 1), jax.nn.one_hot(state.coin, 2)])
-
-    def reset_env(self, key, params):
-        coin = jax.random.bernoulli(key).astype(int)
-        state = ProbeState(time=jnp.asarray(0), coin=coin)
-        return self.observe(state), state
-
-    def step(self, key, state, action, params):
-        key_coin, key_reset = jax.random.split(key)
-        reward = self.reward(state.time, state.coin, action).astype(float)
-        after = ProbeState(state.time + 1, jax.random.bernoulli(key_coin).astype(int))
-        end = after.time == self.length
-        final, (_, first) = self.observe(after), self.reset_env(key_reset, params)
-        state = jax.tree.map(lambda new, old: jnp.where(end, new, old), first, after)
-        info = {"final_observation": final, **{name: reward for name in learner.LOGGED}}
-        terminated, truncated = end & self.terminates, end & (not self.terminates)
-        return self.observe(state), state, reward, terminated, truncated, info
-
-
-class Linear(nn.Module):
-    """Logits of all looks and a value, both linear in the observation."""
-
-    @nn.compact
-    def __call__(self, inputs):
-        logits = nn.Dense(LOOKS**2, use_bias=False, name="logits", kernel_init=nn.initializers.zeros)(inputs)
-        value = nn.Dense(1, use_bias=False, name="value", kernel_init=nn.initializers.normal(0.1))(inputs)
-        return logits, value[..., 0]
-
-
-def constant(time, coin, action):
-    return jnp.ones(())
-
-
-def right_look(time, coin, action):
-    """1 for look (1, 0) while the coin shows 1, for look (0, 1) while it shows 0."""
-    return jnp.where(coin == 1, (action == jnp.array([1, 0])).all(), (action == jnp.array([0, 1])).all())
-
-
-def at_the_end(time, coin, action):
-    return jnp.where(time == 2, 1.0, 0.0)
-
+pytestmark = pytest.mark.usefixtures("quick_compilation")
 
 CONFIG = TrainConfig(
     total_steps=10**6,
@@ -224,14 +155,6 @@ def test_only_whole_episodes_are_counted_and_their_returns_are_unscaled(traced):
     np.testing.assert_array_equal(metrics["episodes"], [2, 8, 8])
     np.testing.assert_allclose(metrics["episode_return"], 4.0)
     np.testing.assert_allclose(metrics["reward"], 1.0)
-
-
-def test_without_a_whole_episode_the_return_is_nan(traced):
-    steps = {"done": jnp.array([[True]]), "episode_length": jnp.array([[3]])}
-    steps |= {name: jnp.ones((1, 1)) for name in ("episode_return", "reward", *learner.LOGGED)}
-    summary = learner.summarise(steps, Params(max_steps_in_episode=4))
-    assert summary["episodes"] == 0
-    assert np.isnan(summary["episode_return"])
 
 
 def test_fresh_samples_have_ratio_one_until_the_first_optimiser_step(traced):

@@ -1,4 +1,4 @@
-"""The loss, its gradient in pieces and the optimiser, by hand arithmetic."""
+"""The loss, its gradient in pieces, the optimiser and the summaries, by hand arithmetic."""
 
 import dataclasses
 import math
@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxtrack import Params
 from train import learner
 from train.agents import Agent
 from train.cells import CellInputs, CellNetwork
@@ -147,3 +148,11 @@ def test_explained_variance():
     assert learner.explained_variance(value, advantage) == 1
     # Values that say nothing explain nothing.
     np.testing.assert_allclose(learner.explained_variance(jnp.zeros(3), value), 0.0, atol=1e-6)
+
+
+def test_without_a_whole_episode_the_return_is_nan():
+    steps = {"done": jnp.array([[True]]), "episode_length": jnp.array([[3]])}
+    steps |= {name: jnp.ones((1, 1)) for name in ("episode_return", "reward", *learner.LOGGED)}
+    summary = learner.summarise(steps, Params(max_steps_in_episode=4))
+    assert summary["episodes"] == 0
+    assert np.isnan(summary["episode_return"])
