@@ -8,12 +8,16 @@ import sys
 import tomllib
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
+
+if TYPE_CHECKING:
+    from rich.console import Console
 
 Options = TypeVar("Options")
 
 BAD_USAGE = 2
 INTERRUPTED = 130
+WIDTH = 150
 
 
 def parse(default: Options, argv: Sequence[str], prog: str, description: str | None = None) -> Options:
@@ -79,6 +83,13 @@ def read_config(path: Path) -> dict[str, Any]:
     if not isinstance(values, dict):
         raise ValueError(f"config = {str(path)!r}: expected a table of fields")
     return values
+
+
+def wide_console() -> "Console":
+    """Console for tables: the terminal's width, or 150 columns in a file or a log."""
+    from rich.console import Console
+
+    return Console(width=None if sys.stdout.isatty() else WIDTH)
 
 
 def run(command: Callable[[Sequence[str]], int]) -> None:

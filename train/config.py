@@ -21,7 +21,7 @@ class TrainConfig:
     encoder: str = "cells"
     """Policy to train: cells (one logit per look from per-cell features), or the paper's
     track-list encoders flatten, bigru, mhsa."""
-    total_steps: int = 1_000_000
+    total_steps: int = 750_000
     """Environment steps, rounded down to whole updates."""
     num_envs: int = 64
     """Environments that run side by side."""
@@ -40,7 +40,7 @@ class TrainConfig:
     """Passes over the samples of an update."""
     num_minibatches: int = 8
     """Optimiser steps per pass."""
-    microbatch: int = 128
+    microbatch: int = 32
     """Samples per piece of a gradient, for the cache; changes nothing but speed."""
     learning_rate: float | None = None
     """Adam's step size at the start; unset, the encoder's own: 0.01 for cells, 0.001 for the others."""

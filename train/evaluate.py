@@ -15,7 +15,7 @@ from rich.table import Table
 from scipy.stats import bootstrap
 
 from jaxtrack import metrics
-from jaxtrack.cli import parse, run
+from jaxtrack.cli import parse, run, wide_console
 from jaxtrack.env import EnvState, SearchTrack
 from jaxtrack.params import Params
 from jaxtrack.policies import POLICIES, Policy, PolicyBuilder
@@ -240,7 +240,7 @@ def main(argv: Sequence[str]) -> int:
         raise ValueError(f"seed = {options.seed}: expected an integer >= 0")
     config, env, weights = load_run(options.run)
     policy = agent_policy(config.encoder, weights, options.greedy)
-    console = Console()
+    console = wide_console()
     results = compare_with_baselines(
         config.encoder, policy, env, config.params, options.episodes, options.seed, console
     )

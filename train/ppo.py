@@ -4,7 +4,6 @@ import csv
 import math
 import platform
 import signal
-import sys
 import time
 from collections.abc import Sequence
 from importlib.metadata import version
@@ -17,7 +16,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
-from jaxtrack.cli import INTERRUPTED, parse, run, take_config
+from jaxtrack.cli import INTERRUPTED, parse, run, take_config, wide_console
 from jaxtrack.env import SearchTrack, make
 from train import learner
 from train.agents import agent_policy
@@ -62,7 +61,7 @@ def main(argv: Sequence[str]) -> int:
     values, rest = take_config(argv)
     config = parse(from_dict(values), rest, "python -m train.ppo", HELP)
     check(config)
-    console = Console(width=None if sys.stdout.isatty() else 150)
+    console = wide_console()
     folder = prepare_folder(config)
     print_config(config, folder, console)
     env, _ = make(config.params, config.static)
