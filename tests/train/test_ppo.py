@@ -42,6 +42,7 @@ SIZES = {
     "static.num-looks": 3,
     "params.max-steps-in-episode": 6,
     "params.beam-azimuth": 0.9,
+    "params.beam-elevation": 0.9,
 }
 SMALL = [f"--{name}={value}" for name, value in SIZES.items()]
 
@@ -111,8 +112,8 @@ def test_a_whole_run_can_be_evaluated_again(whole, tmp_path, capsys):
     before, after = (
         (path / "episodes.csv").read_text().splitlines() for path in (folder, tmp_path / "again")
     )
-    own = [line.split(",")[1:] for line in before.splitlines() if line.startswith("cells")]
-    again = [line.split(",")[1:] for line in after.splitlines()[1:]]
+    own = [line.split(",")[1:] for line in before if line.startswith("cells")]
+    again = [line.split(",")[1:] for line in after[1:]]
     np.testing.assert_allclose(np.array(again, dtype=float), np.array(own, dtype=float), rtol=1e-4)
 
 
