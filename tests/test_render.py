@@ -10,6 +10,7 @@ import pytest
 from PIL import Image
 
 from jaxtrack import metrics, render, scene
+from jaxtrack.cli import run
 from jaxtrack.env import make
 from jaxtrack.models import direction
 from jaxtrack.sensor import in_beam
@@ -162,7 +163,7 @@ def test_wrong_formats_are_refused_by_name(episode, tmp_path, monkeypatch):
 def test_the_command_names_the_wrong_option_in_one_line(arguments, name, monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", ["render", *arguments])
     with pytest.raises(SystemExit) as stopped:
-        render.main()
+        run(render.main)
     assert stopped.value.code == 2
     message = capsys.readouterr().err
     assert message.startswith(f"error: {name} = ")
@@ -178,9 +179,8 @@ def test_the_command_writes_a_picture_and_says_so(episode, tmp_path, monkeypatch
 
     out = tmp_path / "last.png"
     arguments = ["--policy", "random", "--seed", "7", "--steps", "24", "--out", str(out)]
-    monkeypatch.setattr(sys, "argv", ["render", *arguments])
     monkeypatch.setattr(render, "record_episode", record)
-    render.main()
+    assert render.main(arguments) == 0
     captured = capsys.readouterr()
     assert asked == [(10, [0, 7], 24)]
     assert captured.out.startswith(f"{out}: frames 1, ")
