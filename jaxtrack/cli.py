@@ -109,8 +109,9 @@ def run(command: Callable[[Sequence[str]], int]) -> None:
 
 
 def _one_line(box: str) -> str:
-    """The words of tyro's error box, without its frame and its pointer to --help."""
+    """The words of tyro's error box, without its title, its frame and its pointer to --help."""
     words = re.sub(r"\x1b\[[0-9;]*m", "", box)
+    words = "\n".join(line for line in words.splitlines() if not line.startswith("╭"))
     words = re.sub(r"[─━┃┏┓┗┛│╭╮╰╯]|-{3,}", " ", words)
     words = re.sub(r"For full helptext.*", "", " ".join(words.split()))
     return words.strip()
