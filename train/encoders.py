@@ -37,6 +37,9 @@ class BiGRUEncoder(nn.Module):
         """Maps tracks `[B, T, F]` and mask `[B, T]` to a latent `[B, features]`."""
         tracks = zero_padding(tracks, mask)
         forward = GRU(self.hidden, name="forward")(tracks, mask)
+        # One direction after the other: on a machine with two cores XLA (jaxlib 0.10.2) starts both
+        # loops at once, and inside another loop the two then wait for each other for ever.
+        forward, tracks = jax.lax.optimization_barrier((forward, tracks))
         backward = GRU(self.hidden, reverse=True, name="backward")(tracks, mask)
         return nn.relu(_dense(self.features)(jnp.concatenate([forward, backward], axis=-1)))
 
