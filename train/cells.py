@@ -15,9 +15,6 @@ from jaxtrack.params import Params, StaticParams
 from jaxtrack.scan_map import beam_weights, look_grid
 from jaxtrack.sensor import in_beam
 
-CELL_FEATURES = 5
-CONTEXT_FEATURES = 3
-
 LOGIT_SCALE = 10.0
 """Good looks differ from poor ones by a few hundredths of a scan value: small weights must
 be able to tell them apart by several nats, or the policy stays almost uniform."""
