@@ -4,11 +4,10 @@ import jax
 import numpy as np
 
 from jaxtrack import NO_DETECTION, tracker
+from reference.parity.compare import TOLERANCE, estimate_error, expected_error
+from reference.parity.scenes import padded
 from reference.pipeline import StoneSoupTracker
 from reference.translate import slot_keys
-
-from .compare import TOLERANCE, estimate_error, expected_error
-from .scenes import padded
 
 STEP = jax.jit(tracker.step)
 

@@ -9,10 +9,9 @@ import numpy as np
 import pytest
 
 from jaxtrack import NO_DETECTION, Detections, Params, SearchTrack, StaticParams, Tracks, models, tracker
+from reference.parity.compare import TOLERANCE, estimate_error
 from reference.pipeline import StoneSoupTracker
 from reference.translate import slot_keys
-
-from .compare import TOLERANCE, estimate_error
 
 STEPS = 1000
 SHAPES = StaticParams(num_truths=7, max_tracks=40, max_detections=20)

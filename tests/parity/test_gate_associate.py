@@ -13,9 +13,8 @@ from stonesoup.types.hypothesis import SingleDistanceHypothesis
 from stonesoup.types.multihypothesis import MultipleHypothesis
 
 from jaxtrack import NO_DETECTION, Params, association
+from reference.parity.scenes import detections_near, padded, random_tracks
 from reference.pipeline import StoneSoupTracker
-
-from .scenes import detections_near, padded, random_tracks
 
 GATE = jax.jit(association.gate)
 ASSOCIATE = jax.jit(association.associate_nearest_neighbour)

@@ -8,11 +8,11 @@ from stonesoup.types.track import Track
 
 from jaxtrack import Params, lifecycle
 from reference.components import EPOCH, build_components
+from reference.parity.compare import TOLERANCE, mean_error
+from reference.parity.scenes import detections_near, random_tracks, track_list
 from reference.pipeline import StoneSoupTracker, estimate
 from reference.translate import detection_index, to_detections
 
-from .compare import TOLERANCE, mean_error
-from .scenes import detections_near, random_tracks, track_list
 from .stepping import check_step
 
 INITIATE = jax.jit(jax.vmap(lifecycle.initial_estimate, in_axes=(0, None)))

@@ -13,10 +13,9 @@ from stonesoup.metricgenerator.uncertaintymetric import (
 from jaxtrack import Params, Truths, metrics
 from jaxtrack.types import POSITION
 from reference.components import EPOCH
+from reference.parity.compare import TOLERANCE
+from reference.parity.scenes import AHEAD, random_means, random_tracks
 from reference.translate import to_states, to_stone_soup_tracks
-
-from .compare import TOLERANCE
-from .scenes import AHEAD, random_means, random_tracks
 
 GOSPA = jax.jit(metrics.gospa)
 

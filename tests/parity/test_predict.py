@@ -9,10 +9,9 @@ from stonesoup.types.state import GaussianState
 
 from jaxtrack import NO_DETECTION, Params, kalman, models
 from reference.components import build_components, transition_model
+from reference.parity.compare import TOLERANCE, covariance_error, mean_error
+from reference.parity.scenes import random_covariances, random_means, track_list
 from reference.translate import as_vector
-
-from .compare import TOLERANCE, covariance_error, mean_error
-from .scenes import random_covariances, random_means, track_list
 
 TIME_STEPS = [0.005, 0.05, 1.0, 10.0]
 

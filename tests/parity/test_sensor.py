@@ -9,10 +9,9 @@ from stonesoup.types.groundtruth import GroundTruthState
 
 from jaxtrack import Params, StaticParams, Truths, models, sensor
 from reference.components import measurement_model
+from reference.parity.scenes import unit_vectors
 from reference.simulation import rotating_radar, steer
 from reference.translate import as_vector
-
-from .scenes import unit_vectors
 
 NOW = datetime.datetime(2000, 1, 1)
 IN_BEAM = jax.jit(sensor.in_beam)

@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 
 from jaxtrack import Params
+from reference.parity.scenes import AHEAD, BEHIND, UP, detections_near, random_tracks
 from reference.pipeline import StoneSoupTracker
 
-from .scenes import AHEAD, BEHIND, UP, detections_near, random_tracks
 from .stepping import check_step
 
 # Measured: 2.7e-4 standard deviations at most over the scenes below.

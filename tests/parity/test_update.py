@@ -14,10 +14,7 @@ from stonesoup.types.state import State
 
 from jaxtrack import Detections, Params, association, kalman, models
 from reference.components import build_components, measurement_model
-from reference.pipeline import estimate
-from reference.translate import as_vector, to_detections
-
-from .compare import (
+from reference.parity.compare import (
     TOLERANCE,
     covariance_error,
     cross_covariance_error,
@@ -25,7 +22,9 @@ from .compare import (
     estimate_error,
     mean_error,
 )
-from .scenes import AHEAD, BEHIND, UP, random_covariances, random_means, track_list
+from reference.parity.scenes import AHEAD, BEHIND, UP, random_covariances, random_means, track_list
+from reference.pipeline import estimate
+from reference.translate import as_vector, to_detections
 
 NOW = datetime.datetime(2000, 1, 1)
 EXPECT = jax.jit(kalman.predict_detections)

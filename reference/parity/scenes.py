@@ -3,21 +3,30 @@
 import jax.numpy as jnp
 import numpy as np
 
-from jaxtrack import NO_DETECTION, Detections, Tracks
+from jaxtrack import NO_DETECTION, Detections, Params, Tracks
 from reference.components import noise_covariance
+
+Direction = tuple[float, float]
 
 AHEAD, BEHIND, UP = (0.3, 0.2), (np.pi, 0.1), (0.5, 1.45)
 """Directions (azimuth, elevation): the plain one, bearing wrap, elevation fold."""
 
 
-def unit_vectors(azimuth, elevation):
+def unit_vectors(azimuth: np.ndarray, elevation: np.ndarray) -> np.ndarray:
+    """Unit vectors `[..., 3]` towards angles (rad)."""
     return np.stack(
         [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)],
         axis=-1,
     )
 
 
-def random_means(rng, count, towards, spread=0.05, distance=(1500.0, 6000.0)):
+def random_means(
+    rng: np.random.Generator,
+    count: int,
+    towards: Direction,
+    spread: float = 0.05,
+    distance: tuple[float, float] = (1500.0, 6000.0),
+) -> np.ndarray:
     """States `[count, 6]` around a direction (azimuth, elevation in rad)."""
     angles = np.array(towards) + spread * rng.standard_normal((count, 2))
     mean = np.zeros((count, 6))
@@ -26,7 +35,7 @@ def random_means(rng, count, towards, spread=0.05, distance=(1500.0, 6000.0)):
     return mean
 
 
-def random_covariances(rng, count):
+def random_covariances(rng: np.random.Generator, count: int) -> np.ndarray:
     """Positive definite `[count, 6, 6]` with correlations, sigmas of 2-15 m and 1-25 m/s."""
     factor = rng.standard_normal((count, 6, 8))
     covariance = factor @ factor.transpose(0, 2, 1)
@@ -36,7 +45,7 @@ def random_covariances(rng, count):
     return (covariance + covariance.transpose(0, 2, 1)) / 2
 
 
-def track_list(mean, covariance, max_tracks=None):
+def track_list(mean: np.ndarray, covariance: np.ndarray, max_tracks: int | None = None) -> Tracks:
     """Track list with one track per row, born on step 0 from detections 0, 1, ..."""
     count = len(mean)
     padding = 0 if max_tracks is None else max_tracks - count
@@ -52,12 +61,22 @@ def track_list(mean, covariance, max_tracks=None):
     )
 
 
-def random_tracks(rng, count, towards=AHEAD, max_tracks=None, spread=0.05, distance=(1500.0, 6000.0)):
+def random_tracks(
+    rng: np.random.Generator,
+    count: int,
+    towards: Direction = AHEAD,
+    max_tracks: int | None = None,
+    spread: float = 0.05,
+    distance: tuple[float, float] = (1500.0, 6000.0),
+) -> Tracks:
+    """Track list of random means and covariances."""
     mean = random_means(rng, count, towards, spread, distance)
     return track_list(mean, random_covariances(rng, count), max_tracks)
 
 
-def detections_near(rng, tracks, params, count, sigmas=1.5):
+def detections_near(
+    rng: np.random.Generator, tracks: Tracks, params: Params, count: int, sigmas: float = 1.5
+) -> np.ndarray:
     """Detections `[count, 3]` of randomly chosen live tracks, so that some are contested."""
     live = np.flatnonzero(np.asarray(tracks.active))
     chosen = rng.choice(live, count)
@@ -72,7 +91,7 @@ def detections_near(rng, tracks, params, count, sigmas=1.5):
     return value + noise * rng.standard_normal((count, 3))
 
 
-def padded(value, capacity):
+def padded(value: np.ndarray, capacity: int) -> Detections:
     """Detections of `value` `[D, 3]` with empty rows up to `capacity`."""
     rows = len(value)
     full = np.zeros((capacity, 3))

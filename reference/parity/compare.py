@@ -7,37 +7,44 @@ the size of the quantity (a position of 5 km known to 5 m) this is a thousand ti
 """
 
 import numpy as np
+from numpy.typing import ArrayLike
+
+from jaxtrack.tracker import TrackerInfo
+from jaxtrack.types import Tracks
+from reference.pipeline import Estimate, Expected
 
 TOLERANCE = 1e-9
 """Largest error allowed in float64 with the exact Jacobian."""
 
 
-def mean_error(ours, theirs, covariance):
+def mean_error(ours: ArrayLike, theirs: ArrayLike, covariance: ArrayLike) -> float:
     """Largest |a - b| / sigma of `[..., n]`; angles must agree without a turn of 2 pi between."""
     sigma = np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1))
     return _largest(np.abs(np.asarray(ours) - np.asarray(theirs)) / sigma)
 
 
-def covariance_error(ours, theirs):
+def covariance_error(ours: ArrayLike, theirs: ArrayLike) -> float:
     """Largest |A_ij - B_ij| / (sigma_i sigma_j) of `[..., n, n]`."""
     sigma = np.sqrt(np.diagonal(theirs, axis1=-2, axis2=-1))
     return cross_covariance_error(ours, theirs, sigma, sigma)
 
 
-def cross_covariance_error(ours, theirs, sigma_rows, sigma_columns):
+def cross_covariance_error(
+    ours: ArrayLike, theirs: ArrayLike, sigma_rows: np.ndarray, sigma_columns: np.ndarray
+) -> float:
     """Largest |A_ij - B_ij| / (sigma_i sigma_j) of `[..., n, m]`."""
     scale = sigma_rows[..., :, None] * sigma_columns[..., None, :]
     return _largest(np.abs(np.asarray(ours) - np.asarray(theirs)) / scale)
 
 
-def distance_error(ours, theirs):
+def distance_error(ours: ArrayLike, theirs: ArrayLike) -> float:
     """Largest |a - b| / max(1, b) where Stone Soup computed a distance."""
     theirs = np.asarray(theirs)
     known = ~np.isnan(theirs)
     return _largest(np.abs(np.asarray(ours) - theirs)[known] / np.maximum(1.0, theirs[known]))
 
 
-def expected_error(info, slot, expected):
+def expected_error(info: TrackerInfo, slot: int, expected: Expected) -> float:
     """Largest error of all that is predicted for one track: `TrackerInfo` against `Expected`."""
     S = expected.detection_covariance
     sigma = np.sqrt(np.diag(expected.covariance))
@@ -58,7 +65,7 @@ def expected_error(info, slot, expected):
     )
 
 
-def estimate_error(tracks, slot, estimate):
+def estimate_error(tracks: Tracks, slot: int, estimate: Estimate) -> float:
     """Largest error of mean and covariance of one track: `Tracks` against `Estimate`."""
     return _largest(
         [
@@ -68,6 +75,6 @@ def estimate_error(tracks, slot, estimate):
     )
 
 
-def _largest(errors):
+def _largest(errors: ArrayLike) -> float:
     # NaN must fail a comparison with the tolerance, and does; nothing to compare is no error.
     return float(np.max(errors, initial=0.0))
