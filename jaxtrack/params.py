@@ -133,6 +133,14 @@ class Params:
     """GOSPA cut-off c; also the distance within which a track counts for a truth (m)."""
     gospa_order: float = _quantity(2.0, "1", 1.0)
     """GOSPA order p."""
+    gospa_switching_penalty: float = _quantity(0.0, "m", 0.0)
+    """GOSPA over time: cost of a truth passing from one track to another; 0 switches it off (m)."""
+    siap_threshold: float = _quantity(200.0, "m", 0.0, open_low=True)
+    """SIAP: a track can belong to a truth only while it is closer than this (m)."""
+    siap_confirm_steps: int = _quantity(3, "steps", 2)
+    """SIAP: a track belongs to a truth after this many steps in a row, from the first of them on."""
+    siap_end_steps: int = _quantity(2, "steps", 1)
+    """SIAP: a track no longer belongs to its truth after this many steps in a row away from it."""
 
 
 def validate(static: StaticParams, params: Params) -> None:
