@@ -1,27 +1,94 @@
 """Which detection belongs to which track.
 
-Counterparts in Stone Soup: `DistanceHypothesiser` with `Mahalanobis`, `DistanceGater`,
+Counterparts in Stone Soup: `DistanceHypothesiser` with a `Measure`, `DistanceGater`,
 `NearestNeighbour`.
 """
+
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
 
-from jaxtrack.kalman import ExpectedDetections, inverse_3x3
+from jaxtrack.kalman import ExpectedDetections, determinant_3x3, inverse_3x3, measurement_noise
 from jaxtrack.models import wrap_detection
 from jaxtrack.params import Params
-from jaxtrack.types import NO_DETECTION, Detections, Tracks
+from jaxtrack.types import DETECTION_DIM, NO_DETECTION, Detections, Tracks
 
 
-def mahalanobis_distances(expected: ExpectedDetections, detections: Detections) -> jax.Array:
-    """Distances `[T, D]` of every detection from every track's expectation.
+Measure = Callable[[ExpectedDetections, Detections, Params], jax.Array]
+"""Distances `[T, D]` of every detection from every track's expectation."""
 
-    ``sqrt(d^T S^-1 d)`` with ``d = wrap(zbar - z)``: not squared. NaN where S is indefinite.
-    """
+
+def squared_mahalanobis(expected: ExpectedDetections, detections: Detections, params: Params) -> jax.Array:
+    """``d^T S^-1 d`` with ``d = wrap(zbar - z)`` (`SquaredMahalanobis`)."""
+    del params
     inverse_S = jax.vmap(inverse_3x3)(expected.covariance)
-    d = wrap_detection(expected.mean[:, None] - detections.value[None])
-    weighted = (d[..., None] * inverse_S[:, None]).sum(axis=-2)
-    return jnp.sqrt((weighted * d).sum(axis=-1))
+    return _quadratic(_differences(expected, detections), inverse_S)
+
+
+def mahalanobis(expected: ExpectedDetections, detections: Detections, params: Params) -> jax.Array:
+    """``sqrt(d^T S^-1 d)`` with ``d = wrap(zbar - z)`` (`Mahalanobis`). NaN where S is indefinite."""
+    return jnp.sqrt(squared_mahalanobis(expected, detections, params))
+
+
+def euclidean(expected: ExpectedDetections, detections: Detections, params: Params) -> jax.Array:
+    """Length of ``wrap(zbar - z)``, radians and metres mixed (`Euclidean`)."""
+    del params
+    d = _differences(expected, detections)
+    return jnp.sqrt((d * d).sum(axis=-1))
+
+
+def kullback_leibler(expected: ExpectedDetections, detections: Detections, params: Params) -> jax.Array:
+    """Divergence of the expectation N(zbar, S) from the detection N(z, R), in nats (`KLDivergence`).
+
+    ``(ln |R|/|S| - 3 + tr(R^-1 S) + d^T R^-1 d) / 2``.
+    """
+    R, S = measurement_noise(params), expected.covariance
+    inverse_R = inverse_3x3(R)
+    log_ratio = jnp.log(determinant_3x3(R) / jax.vmap(determinant_3x3)(S))
+    fixed = log_ratio - DETECTION_DIM + (inverse_R * S).sum(axis=(-2, -1))
+    spread = jnp.broadcast_to(inverse_R, S.shape)
+    return 0.5 * (fixed[:, None] + _quadratic(_differences(expected, detections), spread))
+
+
+def squared_hellinger(expected: ExpectedDetections, detections: Detections, params: Params) -> jax.Array:
+    """Squared Hellinger distance of N(zbar, S) and N(z, R), in [0, 1] (`SquaredGaussianHellinger`).
+
+    ``1 - sqrt(sqrt(|S| |R|) / |M|) exp(-d^T M^-1 d / 8)`` with ``M = (S + R) / 2``.
+    """
+    R, S = measurement_noise(params), expected.covariance
+    middle = (S + R) / 2
+    determinants = jax.vmap(determinant_3x3)
+    overlap = jnp.sqrt(jnp.sqrt(determinants(S) * determinant_3x3(R)) / determinants(middle))
+    exponent = _quadratic(_differences(expected, detections), jax.vmap(inverse_3x3)(middle)) / 8
+    return jnp.maximum(1 - overlap[:, None] * jnp.exp(-exponent), 0.0)
+
+
+def hellinger(expected: ExpectedDetections, detections: Detections, params: Params) -> jax.Array:
+    """Hellinger distance of N(zbar, S) and N(z, R), in [0, 1] (`GaussianHellinger`)."""
+    return jnp.sqrt(squared_hellinger(expected, detections, params))
+
+
+MEASURES: dict[str, Measure] = {
+    "mahalanobis": mahalanobis,
+    "squared_mahalanobis": squared_mahalanobis,
+    "euclidean": euclidean,
+    "kullback_leibler": kullback_leibler,
+    "hellinger": hellinger,
+    "squared_hellinger": squared_hellinger,
+}
+"""Measures by name; gate threshold and missed distance have the measure's unit."""
+
+
+def _differences(expected: ExpectedDetections, detections: Detections) -> jax.Array:
+    """``wrap(zbar - z)`` `[T, D, 3]`."""
+    return wrap_detection(expected.mean[:, None] - detections.value[None])
+
+
+def _quadratic(d: jax.Array, matrix: jax.Array) -> jax.Array:
+    """``d^T M d`` `[T, D]` of differences `[T, D, 3]` and one matrix `[T, 3, 3]` per track."""
+    weighted = (d[..., None] * matrix[:, None]).sum(axis=-2)
+    return (weighted * d).sum(axis=-1)
 
 
 def gate(distances: jax.Array, predicted: Tracks, detections: Detections, params: Params) -> jax.Array:

@@ -10,12 +10,13 @@ from flax import struct
 from gymnax.environments import environment
 
 from jaxtrack import metrics, spaces, tracker
+from jaxtrack.association import MEASURES
 from jaxtrack.observation import TRACK_FEATURES, Observation, observe
 from jaxtrack.params import Params, StaticParams, check_trajectories, validate
 from jaxtrack.reward import reward_terms
 from jaxtrack.scan_map import initial_scan_map, update_scan_map
 from jaxtrack.sensor import SensorNoise, detect, look_angles, sample_noise
-from jaxtrack.truth import initiate_truths, propagate_truths
+from jaxtrack.truth import TruthNoise, initiate_truths, propagate_truths, sample_truth_noise
 from jaxtrack.types import Detections, Tracks, Truths
 
 ENV_ID = "SearchTrack-v0"
@@ -30,6 +31,7 @@ class EnvState(environment.EnvState):
         truths: the true targets; no policy may read them.
         tracks: the track list.
         scan_map: `[M, M]` scan value of every pixel.
+        num_born: `[]` truths born since the start, those that found no row included.
         num_initiated: `[]` tracks initiated since the start.
     """
 
@@ -37,6 +39,7 @@ class EnvState(environment.EnvState):
     truths: Truths
     tracks: Tracks
     scan_map: jax.Array  # [M, M]
+    num_born: jax.Array
     num_initiated: jax.Array
 
 
@@ -44,11 +47,11 @@ class StepNoise(struct.PyTreeNode):
     """All that is random in one step.
 
     Attributes:
-        motion: `[N, 3, 2]` standard normal, the truths' accelerations.
+        truths: the draws of motion, deaths and births.
         sensor: the draws of the look.
     """
 
-    motion: jax.Array  # [N, 3, 2]
+    truths: TruthNoise
     sensor: SensorNoise
 
 
@@ -58,12 +61,14 @@ class StepRecord(struct.PyTreeNode):
     Attributes:
         look: `[2]` boresight azimuth and elevation (rad).
         detections: what the look returned.
+        num_dropped_truths: `[]` births for which no row was left.
         num_dropped_detections: `[]` detections for which no slot was free.
         tracker: every intermediate of the tracker.
     """
 
     look: jax.Array
     detections: Detections
+    num_dropped_truths: jax.Array
     num_dropped_detections: jax.Array
     tracker: tracker.TrackerInfo
 
@@ -102,11 +107,13 @@ class SearchTrack(environment.Environment[EnvState, Params]):
     def reset_env(self, key: jax.Array, params: Params) -> tuple[Observation, EnvState]:
         """New truths, no tracks, a field never seen."""
         check_trajectories(self.static, params)
+        truths = initiate_truths(key, self.static, params)
         state = EnvState(
             time=jnp.asarray(0, dtype=int),
-            truths=initiate_truths(key, self.static, params),
+            truths=truths,
             tracks=Tracks.empty(self.static.max_tracks),
             scan_map=initial_scan_map(self.static),
+            num_born=jnp.sum(truths.alive),
             num_initiated=jnp.asarray(0, dtype=int),
         )
         return self.observe(key, state, None, params), state
@@ -127,20 +134,23 @@ class SearchTrack(environment.Environment[EnvState, Params]):
     ) -> tuple[EnvState, StepRecord]:
         """The deterministic core: truths move, the radar looks, the tracker runs."""
         time = state.time + 1
-        truths = propagate_truths(state.truths, noise.motion, time, params)
+        truths, num_born = propagate_truths(state.truths, state.num_born, noise.truths, time, params)
         look = look_angles(action, self.static, params)
         detections, num_dropped = detect(truths, look, noise.sensor, self.static, params)
-        tracks, info = tracker.step(state.tracks, detections, params.time_step, time, params)
+        measure = MEASURES[self.static.measure]
+        tracks, info = tracker.step(state.tracks, detections, params.time_step, time, params, measure)
         scan_map = update_scan_map(state.scan_map, look, self.static, params)
         num_initiated = state.num_initiated + jnp.sum(info.initiated)
-        state = EnvState(time, truths, tracks, scan_map, num_initiated)
-        return state, StepRecord(look, detections, num_dropped, info)
+        rows = self.static.num_truths
+        rowless = jnp.maximum(num_born, rows) - jnp.maximum(state.num_born, rows)
+        state = EnvState(time, truths, tracks, scan_map, num_born, num_initiated)
+        return state, StepRecord(look, detections, rowless, num_dropped, info)
 
     def sample_noise(self, key: jax.Array) -> StepNoise:
         """Draws all that is random in one step; the key is consumed."""
-        key_motion, key_sensor = jax.random.split(key)
-        motion = jax.random.normal(key_motion, (self.static.num_truths, 3, 2))
-        return StepNoise(motion=motion, sensor=sample_noise(key_sensor, self.static))
+        key_motion, key_sensor, key_life = jax.random.split(key, 3)
+        truths = sample_truth_noise(key_motion, key_life, self.static.num_truths)
+        return StepNoise(truths=truths, sensor=sample_noise(key_sensor, self.static))
 
     def observe(
         self, key: jax.Array, state: EnvState, action: jax.Array | None, params: Params
@@ -186,6 +196,7 @@ def step_info(
         "reward_track": terms[0],
         "reward_search": terms[1],
         "num_detections": jnp.sum(record.detections.active),
+        "dropped_truths": record.num_dropped_truths,
         "dropped_detections": record.num_dropped_detections,
         "dropped_tracks": record.tracker.num_dropped,
     }

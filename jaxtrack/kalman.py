@@ -120,12 +120,21 @@ def cholesky(matrix: jax.Array) -> jax.Array:
 
 def inverse_3x3(matrix: jax.Array) -> jax.Array:
     """Inverse of `[3, 3]` matrices by cofactors, which is exact under scaling of units."""
+    cofactors = _cofactors(matrix)
+    return cofactors / jnp.dot(matrix[0], cofactors[:, 0])
+
+
+def determinant_3x3(matrix: jax.Array) -> jax.Array:
+    """Determinant of `[3, 3]` matrices by cofactors."""
+    return jnp.dot(matrix[0], _cofactors(matrix)[:, 0])
+
+
+def _cofactors(matrix: jax.Array) -> jax.Array:
     rows = matrix[0], matrix[1], matrix[2]
-    cofactors = jnp.stack(
+    return jnp.stack(
         [jnp.cross(rows[1], rows[2]), jnp.cross(rows[2], rows[0]), jnp.cross(rows[0], rows[1])],
         axis=-1,
     )
-    return cofactors / jnp.dot(rows[0], cofactors[:, 0])
 
 
 def measurement_noise(params: Params) -> jax.Array:

@@ -14,6 +14,14 @@ import numpy as np
 from flax import struct
 
 REWARDS = ("paper", "as_printed", "information")
+MEASURES = (
+    "mahalanobis",
+    "squared_mahalanobis",
+    "euclidean",
+    "kullback_leibler",
+    "hellinger",
+    "squared_hellinger",
+)
 
 
 def looks_per_axis(field: float, beam: float) -> int:
@@ -31,7 +39,7 @@ class StaticParams:
     """Shapes and choices of code (hashable; a change recompiles)."""
 
     num_truths: int = 10
-    """Truths, all alive from the start (replayed trajectories may say otherwise)."""
+    """Truths that can exist in one episode, those born later included."""
     max_tracks: int = 20
     """Track slots; an excess is dropped and counted in `info`."""
     max_detections: int = 10
@@ -46,6 +54,9 @@ class StaticParams:
     """Actions are (azimuth, elevation) in radians instead of two look indices."""
     reward: str = "paper"
     """Reward by name: paper, as_printed or information."""
+    measure: str = "mahalanobis"
+    """Distance of a detection from a track: mahalanobis, squared_mahalanobis, euclidean,
+    kullback_leibler, hellinger or squared_hellinger; the gate has its unit."""
 
     def __post_init__(self) -> None:
         """Refuses shapes that make no sense, naming the field."""
@@ -56,8 +67,9 @@ class StaticParams:
                 isinstance(value, bool) or not isinstance(value, int) or value < low.get(field.name, 1)
             ):
                 raise ValueError(f"{field.name} = {value!r}: expected an integer >= {low.get(field.name, 1)}")
-        if self.reward not in REWARDS:
-            raise ValueError(f"reward = {self.reward!r}: expected one of {', '.join(REWARDS)}")
+        for name, known in (("reward", REWARDS), ("measure", MEASURES)):
+            if getattr(self, name) not in known:
+                raise ValueError(f"{name} = {getattr(self, name)!r}: expected one of {', '.join(known)}")
 
 
 def _quantity(default: float, unit: str, low: float, high: float = math.inf, open_low: bool = False) -> Any:
@@ -92,6 +104,12 @@ class Params:
     """Standard deviation of a truth's initial velocity, each axis (m/s)."""
     truth_process_noise: float = _quantity(1.0, "m^2/s^3", 0.0)
     """Spectral density of the truths' white acceleration; 0 switches it off (m^2/s^3)."""
+    initial_truths: int | None = None
+    """Truths alive at the start; unset, all of them."""
+    birth_rate: float = _quantity(0.0, "1/step", 0.0, 80.0)  # e^-80 is still a number in float32
+    """Expected number of truths born per step."""
+    death_probability: float = _quantity(0.0, "1/step", 0.0, 1.0)
+    """Probability that a truth ends in a step."""
     trajectories: jax.Array | None = None
     """Recorded truths `[K, N, 6]` to replay instead of simulating; NaN where absent."""
 
@@ -103,7 +121,7 @@ class Params:
     """Standard deviation of measured range (m)."""
     detection_probability: float = _quantity(1.0, "1", 0.0, 1.0)
     """Probability that a truth in the beam is detected."""
-    clutter_rate: float = _quantity(0.0, "1/look", 0.0)
+    clutter_rate: float = _quantity(0.0, "1/look", 0.0, 80.0)
     """Expected number of false detections per look."""
 
     process_noise: float = _quantity(1.0, "m^2/s^3", 0.0)
@@ -158,6 +176,11 @@ def validate(static: StaticParams, params: Params) -> None:
         raise ValueError(
             f"clutter_rate = {params.clutter_rate}: expected at most max_clutter = "
             f"{static.max_clutter} 1/look"
+        )
+    first = static.num_truths if params.initial_truths is None else np.asarray(params.initial_truths)
+    if np.any(first < 0) or np.any(first > static.num_truths):
+        raise ValueError(
+            f"initial_truths = {params.initial_truths}: expected an integer in [0, {static.num_truths}]"
         )
     check_trajectories(static, params)
 

@@ -10,6 +10,7 @@ from flax import struct
 
 from jaxtrack.models import direction, spherical, wrap_detection
 from jaxtrack.params import Params, StaticParams
+from jaxtrack.sampling import poisson_quantile
 from jaxtrack.types import NO_TRUTH, Detections, Truths, position
 
 
@@ -128,13 +129,7 @@ def detect(
 
 def clutter_count(uniform: jax.Array, static: StaticParams, params: Params) -> tuple[jax.Array, jax.Array]:
     """Poisson number of false detections from one uniform draw, and its excess over capacity."""
-    counts = jnp.arange(4 * static.max_clutter)
-    rate = jnp.asarray(params.clutter_rate, dtype=float)
-    # Terms rate^k / k! by a running product: no logarithm of a zero rate.
-    terms = jnp.cumprod(jnp.where(counts == 0, jnp.exp(-rate), rate / jnp.maximum(counts, 1)))
-    number = jnp.sum(uniform >= jnp.cumsum(terms)) if static.max_clutter else jnp.asarray(0)
-    # Rounding of the last sums must not make clutter where the rate is zero.
-    number = jnp.where(rate > 0, number, 0)
+    number = poisson_quantile(uniform, params.clutter_rate, 4 * static.max_clutter)
     return jnp.minimum(number, static.max_clutter), jnp.maximum(number - static.max_clutter, 0)
 
 

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from flax import struct
 
 from jaxtrack import association, kalman, lifecycle
+from jaxtrack.association import Measure, mahalanobis
 from jaxtrack.kalman import ExpectedDetections
 from jaxtrack.params import Params
 from jaxtrack.types import STATE_DIM, Detections, Scalar, Tracks, where_rows
@@ -19,7 +20,7 @@ class TrackerInfo(struct.PyTreeNode):
     Attributes:
         predicted: the track list predicted to this step.
         expected: measurement prediction of every track.
-        distances: `[T, D]` Mahalanobis distances before the gate.
+        distances: `[T, D]` distances before the gate.
         associated: `[T]` index of each track's detection, or `NO_DETECTION`.
         updated: the track list after the update, before deletion.
         deleted: `[T]` which tracks were deleted on this step.
@@ -38,7 +39,12 @@ class TrackerInfo(struct.PyTreeNode):
 
 
 def step(
-    tracks: Tracks, detections: Detections, time_step: Scalar, index: jax.Array, params: Params
+    tracks: Tracks,
+    detections: Detections,
+    time_step: Scalar,
+    index: jax.Array,
+    params: Params,
+    measure: Measure = mahalanobis,
 ) -> tuple[Tracks, TrackerInfo]:
     """Predict, gate, associate, update, delete, initiate: in Stone Soup's order.
 
@@ -48,6 +54,7 @@ def step(
         time_step: time since the previous step (s).
         index: number of this step, which becomes the birth step of new tracks.
         params: numbers of the tracker.
+        measure: distance of a detection from a track, one of `association.MEASURES`.
 
     Returns:
         The track list after this step, and all intermediates.
@@ -55,7 +62,7 @@ def step(
     tracks, detections = _blank_empty_rows(tracks, detections, params)
     predicted = kalman.predict(tracks, time_step, params)
     expected = kalman.predict_detections(predicted, params)
-    distances = association.mahalanobis_distances(expected, detections)
+    distances = measure(expected, detections, params)
     admissible = association.gate(distances, predicted, detections, params)
     associated = association.associate_nearest_neighbour(admissible)
     updated = kalman.update(predicted, expected, detections, associated)

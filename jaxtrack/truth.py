@@ -1,14 +1,38 @@
-"""Where the targets are: constant velocity with white acceleration, or replayed recordings.
+"""Where the targets are: constant velocity with white acceleration, births and deaths; or recordings.
 
-Counterpart in Stone Soup: `MultiTargetGroundTruthSimulator` without births and deaths.
+Counterpart in Stone Soup: `MultiTargetGroundTruthSimulator`.
 """
 
 import jax
 import jax.numpy as jnp
+from flax import struct
 
 from jaxtrack.models import constant_velocity, direction
 from jaxtrack.params import Params, StaticParams
+from jaxtrack.sampling import poisson_quantile
 from jaxtrack.types import Scalar, Truths
+
+
+class TruthNoise(struct.PyTreeNode):
+    """The random draws of one step of the truths.
+
+    Attributes:
+        motion: `[N, 3, 2]` standard normal, the accelerations; for a truth born on this step,
+            which does not move yet, its place and velocity.
+        death: `[N]` uniform in [0, 1), below the death probability the truth ends.
+        birth_count: `[]` uniform, turned into a Poisson number.
+    """
+
+    motion: jax.Array  # [N, 3, 2]
+    death: jax.Array  # [N]
+    birth_count: jax.Array  # []
+
+
+def sample_truth_noise(key: jax.Array, key_life: jax.Array, num_truths: int) -> TruthNoise:
+    """Draws all that is random in one step of the truths; both keys are consumed."""
+    uniform = jax.random.uniform(key_life, (num_truths + 1,))
+    motion = jax.random.normal(key, (num_truths, 3, 2))
+    return TruthNoise(motion=motion, death=uniform[:-1], birth_count=uniform[-1])
 
 
 def initiate_truths(key: jax.Array, static: StaticParams, params: Params) -> Truths:
@@ -17,30 +41,80 @@ def initiate_truths(key: jax.Array, static: StaticParams, params: Params) -> Tru
         return replay_truths(jnp.asarray(0), params)
     key_angles, key_range, key_velocity = jax.random.split(key, 3)
     n = static.num_truths
-    angles = params.field_limit * jax.random.uniform(key_angles, (n, 2), minval=-1.0, maxval=1.0)
+    angles = jax.random.uniform(key_angles, (n, 2), minval=-1.0, maxval=1.0)
     share = jax.random.uniform(key_range, (n, 1))
+    state = born_state(angles, share, jax.random.normal(key_velocity, (n, 3)), params)
+    first = n if params.initial_truths is None else params.initial_truths
+    return Truths(state=state, alive=jnp.arange(n) < first)
+
+
+def born_state(angles: jax.Array, share: jax.Array, velocity: jax.Array, params: Params) -> jax.Array:
+    """States `[N, 6]` of new truths.
+
+    Args:
+        angles: `[N, 2]` azimuth and elevation as shares of the field's limit, in [-1, 1].
+        share: `[N, 1]` place between the smallest and the largest range, in [0, 1].
+        velocity: `[N, 3]` standard normal.
+        params: numbers of the scenario.
+    """
+    azimuth, elevation = params.field_limit * angles[:, 0], params.field_limit * angles[:, 1]
     distance = params.min_range + share * (params.max_range - params.min_range)
-    positions = distance * direction(angles[:, 0], angles[:, 1])
-    velocities = params.truth_velocity_sigma * jax.random.normal(key_velocity, (n, 3))
-    state = jnp.stack([positions, velocities], axis=-1).reshape(n, 6)
-    return Truths(state=state, alive=jnp.ones(n, dtype=bool))
+    positions = distance * direction(azimuth, elevation)
+    velocities = params.truth_velocity_sigma * velocity
+    return jnp.stack([positions, velocities], axis=-1).reshape(-1, 6)
 
 
-def propagate_truths(truths: Truths, noise: jax.Array, step: jax.Array, params: Params) -> Truths:
-    """Moves the truths by one time step, or looks them up where trajectories are replayed.
+def propagate_truths(
+    truths: Truths, num_born: jax.Array, noise: TruthNoise, step: jax.Array, params: Params
+) -> tuple[Truths, jax.Array]:
+    """Deaths, motion, births, in Stone Soup's order; or the recording where there is one.
 
     Args:
         truths: the truths before the step.
-        noise: `[N, 3, 2]` standard normal draws, per axis for position and velocity.
+        num_born: truths born since the start, those for which no row was left included.
+        noise: the draws of this step.
         step: index of the step that the truths move to.
         params: numbers of the scenario.
+
+    Returns:
+        The truths after the step, and the new `num_born`.
     """
     if params.trajectories is not None:
-        return replay_truths(step, params)
+        return replay_truths(step, params), num_born
+    surviving = end_truths(truths, noise.death, params)
+    moved = move_truths(surviving, noise.motion, params)
+    return begin_truths(moved, num_born, noise, params)
+
+
+def end_truths(truths: Truths, uniform: jax.Array, params: Params) -> Truths:
+    """Ends every truth with the death probability.
+
+    Stone Soup ends a truth at ``u <= p``; here it is ``u < p``, so that 0 means never.
+    """
+    return truths.replace(alive=truths.alive & ~(uniform < params.death_probability))
+
+
+def move_truths(truths: Truths, noise: jax.Array, params: Params) -> Truths:
+    """Moves the truths by one time step; `noise` `[N, 3, 2]` is standard normal."""
     F, _ = constant_velocity(params.time_step, 0.0)
     factor = process_noise_factor(params.time_step, params.truth_process_noise)
     shaken = jnp.einsum("ij,naj->nai", factor, noise).reshape(truths.state.shape)
     return truths.replace(state=jnp.einsum("ij,nj->ni", F, truths.state) + shaken)
+
+
+def begin_truths(
+    truths: Truths, num_born: jax.Array, noise: TruthNoise, params: Params
+) -> tuple[Truths, jax.Array]:
+    """A Poisson number of new truths, in rows never used: a row is one truth for the whole episode."""
+    rows = truths.alive.shape[0]
+    births = poisson_quantile(noise.birth_count, params.birth_rate, 4 * rows)
+    row = jnp.arange(rows)
+    born = (row >= num_born) & (row < num_born + births)
+    # A newborn does not move: its six draws of motion serve for its place and velocity.
+    uniform = jax.scipy.stats.norm.cdf(noise.motion[:, :, 0])
+    state = born_state(2 * uniform[:, :2] - 1, uniform[:, 2:], noise.motion[:, :, 1], params)
+    state = jnp.where(born[:, None], state, truths.state)
+    return Truths(state=state, alive=truths.alive | born), num_born + births
 
 
 def process_noise_factor(time_step: Scalar, process_noise: Scalar) -> jax.Array:

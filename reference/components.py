@@ -10,7 +10,14 @@ from stonesoup.deleter.error import CovarianceBasedDeleter
 from stonesoup.gater.distance import DistanceGater
 from stonesoup.hypothesiser.distance import DistanceHypothesiser
 from stonesoup.initiator.simple import SimpleMeasurementInitiator
-from stonesoup.measures import Mahalanobis
+from stonesoup.measures import Euclidean, Mahalanobis
+from stonesoup.measures.state import (
+    GaussianHellinger,
+    KLDivergence,
+    Measure,
+    SquaredGaussianHellinger,
+    SquaredMahalanobis,
+)
 from stonesoup.models.measurement.nonlinear import CartesianToElevationBearingRange
 from stonesoup.models.transition.linear import CombinedLinearGaussianTransitionModel, ConstantVelocity
 from stonesoup.predictor.kalman import KalmanPredictor
@@ -23,6 +30,20 @@ from jaxtrack.types import POSITION, STATE_DIM, VELOCITY
 
 EPOCH = datetime.datetime(2000, 1, 1)
 """Time of step 0."""
+
+MEASURES: dict[str, type[Measure]] = {
+    "mahalanobis": Mahalanobis,
+    "squared_mahalanobis": SquaredMahalanobis,
+    "euclidean": Euclidean,
+    "kullback_leibler": KLDivergence,
+    "hellinger": GaussianHellinger,
+    "squared_hellinger": SquaredGaussianHellinger,
+}
+"""Stock measures by the names of `jaxtrack.association.MEASURES`.
+
+The last three need detections that carry their own covariance (`GaussianDetection`): with a
+plain `Detection` they fail for want of one.
+"""
 
 
 class ExactCartesianToElevationBearingRange(CartesianToElevationBearingRange):
@@ -56,7 +77,7 @@ class Components:
     measurement_model: CartesianToElevationBearingRange
     predictor: KalmanPredictor
     updater: UnscentedKalmanUpdater
-    measure: Mahalanobis
+    measure: Measure
     hypothesiser: DistanceGater
     associator: NearestNeighbour
     initiator: SimpleMeasurementInitiator
@@ -73,30 +94,31 @@ class Components:
         )
 
 
-def build_components(params: Params, exact_jacobian: bool = True) -> Components:
+def build_components(params: Params, exact_jacobian: bool = True, measure: str = "mahalanobis") -> Components:
     """Builds every component.
 
     Args:
         params: numbers of the tracker.
         exact_jacobian: whether initiation uses the exact Jacobian, or the stock finite
             differences, whose covariance is only good to about 1e-4.
+        measure: name of the distance of hypothesiser and gater.
     """
     model = measurement_model(params, exact_jacobian)
     predictor = KalmanPredictor(transition_model(params.process_noise))
     updater = UnscentedKalmanUpdater(
         measurement_model=None, alpha=params.alpha, beta=params.beta, kappa=params.kappa
     )
-    measure = Mahalanobis()
+    distance = MEASURES[measure]()
     hypothesiser = DistanceGater(
-        DistanceHypothesiser(predictor, updater, measure, missed_distance=params.missed_distance),
-        measure,
+        DistanceHypothesiser(predictor, updater, distance, missed_distance=params.missed_distance),
+        distance,
         params.gate_threshold,
     )
     return Components(
         measurement_model=model,
         predictor=predictor,
         updater=updater,
-        measure=measure,
+        measure=distance,
         hypothesiser=hypothesiser,
         associator=NearestNeighbour(hypothesiser),
         initiator=SimpleMeasurementInitiator(prior_state(params), model),

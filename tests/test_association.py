@@ -9,13 +9,15 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from jaxtrack import NO_DETECTION, Detections, Params
-from jaxtrack.association import associate_nearest_neighbour, gate, mahalanobis_distances
+from jaxtrack import params as params_module
+from jaxtrack.association import MEASURES, associate_nearest_neighbour, gate, mahalanobis
 from jaxtrack.kalman import ExpectedDetections
 
 INF = np.inf
 associate = jax.jit(associate_nearest_neighbour)
 associate_batch = jax.jit(jax.vmap(associate_nearest_neighbour))
-distances_of = jax.jit(mahalanobis_distances)
+distances_of = jax.jit(mahalanobis)
+PARAMS = Params()
 
 
 def expectation(means, S):
@@ -41,7 +43,7 @@ def plain_greedy(distances):
 def test_mahalanobis_distances_by_hand():
     expected = expectation([[0, 0, 1000], [0, 0, 1003]], np.diag([4e-6, 1e-6, 9.0]))
     detections = Detections.from_values([[2e-3, 0, 1000], [0, 2e-3, 1003], [0, 0, 1000]])
-    distances = distances_of(expected, detections)
+    distances = distances_of(expected, detections, PARAMS)
     root = np.sqrt
     # Elevation 1 sigma; bearing 2 sigma; range 3 m is 1 sigma.
     np.testing.assert_allclose(distances, [[1, root(4 + 1), 0], [root(1 + 1), 2, 1]], rtol=1e-4, atol=1e-6)
@@ -50,14 +52,38 @@ def test_mahalanobis_distances_by_hand():
 def test_correlated_innovations_use_the_whole_covariance(x64):
     S = np.array([[2e-6, 1e-6, 1e-4], [1e-6, 3e-6, -2e-4], [1e-4, -2e-4, 5.0]])
     d = np.array([1e-3, 2e-3, -1.0])
-    distances = distances_of(expectation([[0, 0, 0]], S), Detections.from_values([d]))
+    distances = distances_of(expectation([[0, 0, 0]], S), Detections.from_values([d]), PARAMS)
     np.testing.assert_allclose(distances[0, 0], np.sqrt(d @ np.linalg.solve(S, d)), rtol=1e-10)
 
 
 def test_distances_take_the_short_way_round():
     expected = expectation([[0, np.pi - 1e-3, 1000]], np.diag([1e-6, 1e-6, 1.0]))
-    distances = distances_of(expected, Detections.from_values([[0, -np.pi + 1e-3, 1000]]))
+    distances = distances_of(expected, Detections.from_values([[0, -np.pi + 1e-3, 1000]]), PARAMS)
     np.testing.assert_allclose(distances, [[2.0]], rtol=1e-3)
+
+
+def test_measures_by_hand(x64):
+    """S = 4 R and a range off by two sigmas of R: every measure of one line of arithmetic."""
+    R = np.array([PARAMS.elevation_sigma, PARAMS.bearing_sigma, PARAMS.range_sigma]) ** 2
+    expected = expectation([[0, 0, 1000]], np.diag(4 * R))
+    detections = Detections.from_values([[0, 0, 1000 + 2 * PARAMS.range_sigma]])
+    squared_hellinger = 1 - np.sqrt(4**1.5 / 2.5**3) * np.exp(-4 / 2.5 / 8)
+    by_hand = {
+        "mahalanobis": 1.0,
+        "squared_mahalanobis": 1.0,
+        "euclidean": 2 * PARAMS.range_sigma,
+        "kullback_leibler": 0.5 * (-3 * np.log(4) - 3 + 3 * 4 + 4),
+        "squared_hellinger": squared_hellinger,
+        "hellinger": np.sqrt(squared_hellinger),
+    }
+    assert by_hand.keys() == MEASURES.keys()
+    for name, value in by_hand.items():
+        ours = jax.jit(MEASURES[name])(expected, detections, PARAMS)
+        np.testing.assert_allclose(ours, [[value]], rtol=1e-12, err_msg=name)
+
+
+def test_every_measure_can_be_asked_for_by_name():
+    assert set(params_module.MEASURES) == set(MEASURES)
 
 
 @pytest.mark.parametrize(("gate_threshold", "missed"), [(5.0, 9.0), (9.0, 5.0)])

@@ -36,7 +36,7 @@ def scene(seed, time=3):
     )
     truths = Truths(state=jnp.asarray(rng.normal(0, 1000, (3, 6)), dtype=float), alive=jnp.ones(3, bool))
     scan_map = jnp.asarray(rng.uniform(0, 1, (M, M)), dtype=float)
-    return EnvState(jnp.asarray(time), truths, tracks, scan_map, jnp.asarray(0))
+    return EnvState(jnp.asarray(time), truths, tracks, scan_map, jnp.asarray(0), jnp.asarray(0))
 
 
 @pytest.fixture(scope="module")

@@ -7,12 +7,30 @@ import pytest
 
 from jaxtrack import Params, StaticParams, Truths
 from jaxtrack.models import constant_velocity, spherical
-from jaxtrack.truth import initiate_truths, process_noise_factor, propagate_truths
+from jaxtrack.truth import (
+    TruthNoise,
+    begin_truths,
+    initiate_truths,
+    move_truths,
+    process_noise_factor,
+    propagate_truths,
+    sample_truth_noise,
+)
 from jaxtrack.types import position, velocity
 
 MANY = StaticParams(num_truths=4000)
 initiate = jax.jit(initiate_truths, static_argnums=1)
 propagate = jax.jit(propagate_truths)
+move = jax.jit(move_truths)
+
+
+def draws(rows, motion=0.0, death=0.5, birth_count=0.5):
+    """Noise of one step in which every row draws the same, unless arrays are given."""
+    return TruthNoise(
+        motion=jnp.broadcast_to(motion, (rows, 3, 2)).astype(float),
+        death=jnp.broadcast_to(death, (rows,)).astype(float),
+        birth_count=jnp.asarray(birth_count, dtype=float),
+    )
 
 
 @pytest.fixture(scope="module")
@@ -54,7 +72,7 @@ def test_the_spread_of_moving_truths_is_Q():
     count, params = MANY.num_truths, Params(time_step=0.5, truth_process_noise=3.0)
     truths = Truths(state=jnp.zeros((count, 6)), alive=jnp.ones(count, dtype=bool))
     noise = jax.random.normal(jax.random.key(3), (count, 3, 2))
-    moved = propagate(truths, noise, 1, params)
+    moved = move(truths, noise, params)
     _, Q = constant_velocity(0.5, 3.0)
     scale = np.sqrt(np.outer(np.diag(Q), np.diag(Q)))
     # A sample correlation of n draws has a standard error of at most sqrt(2/n) = 0.022.
@@ -64,8 +82,8 @@ def test_the_spread_of_moving_truths_is_Q():
 def test_without_process_noise_truths_fly_exactly_straight():
     params = Params(time_step=0.5, truth_process_noise=0.0)
     truths = Truths(state=jnp.array([[1000.0, 8, -200, -4, 50, 2]]), alive=jnp.ones(1, dtype=bool))
-    for step in range(1, 5):
-        truths = propagate(truths, jnp.ones((1, 3, 2)), step, params)
+    for _ in range(4):
+        truths = move(truths, jnp.ones((1, 3, 2)), params)
     # Four steps of half a second.
     np.testing.assert_array_equal(truths.state, [[1016.0, 8, -208, -4, 54, 2]])
 
@@ -74,7 +92,7 @@ def test_motion_is_linear_in_the_noise_of_its_own_truth_and_axis(static):
     params = Params(time_step=0.5, truth_process_noise=3.0)
     truths = Truths(state=jnp.zeros((3, 6)), alive=jnp.ones(3, dtype=bool))
     noise = jnp.zeros((3, 3, 2)).at[1, 2].set(jnp.array([1.0, -2.0]))
-    moved = np.asarray(propagate(truths, noise, 1, params).state)
+    moved = np.asarray(move(truths, noise, params).state)
     expected = np.linalg.cholesky(np.asarray(constant_velocity(0.5, 3.0)[1][:2, :2])) @ [1.0, -2.0]
     np.testing.assert_allclose(moved[1, 4:6], expected, rtol=1e-5)
     assert np.count_nonzero(moved) == 2
@@ -94,7 +112,7 @@ def test_recordings_replace_birth_and_motion(recording, static):
     np.testing.assert_array_equal(truths.alive, [True, False, True])
     np.testing.assert_array_equal(truths.state[0], recording[0, 0])
     np.testing.assert_array_equal(truths.state[1], np.zeros(6))
-    truths = propagate(truths, jnp.ones((3, 3, 2)), 1, params)
+    truths, _ = propagate(truths, jnp.asarray(2), draws(3, motion=1.0), 1, params)
     np.testing.assert_array_equal(truths.alive, [True, True, False])
     np.testing.assert_array_equal(truths.state[:2], recording[1, :2])
 
@@ -102,6 +120,72 @@ def test_recordings_replace_birth_and_motion(recording, static):
 def test_the_last_row_stays_after_the_end_of_a_recording(recording, static):
     params = Params(trajectories=jnp.asarray(recording))
     truths = initiate(jax.random.key(0), static, params)
-    after = propagate(truths, jnp.zeros((3, 3, 2)), 7, params)
+    after, _ = propagate(truths, jnp.asarray(2), draws(3), 7, params)
     np.testing.assert_array_equal(after.state[:2], recording[1, :2])
     np.testing.assert_array_equal(after.alive, [True, True, False])
+
+
+def test_only_the_first_truths_are_alive_at_the_start(static):
+    truths = initiate(jax.random.key(0), static, Params(initial_truths=2))
+    np.testing.assert_array_equal(truths.alive, [True, True, False])
+
+
+def test_deaths_come_before_and_births_after_motion():
+    """Row 0 dies, row 1 lives and moves, row 2 is born and has not moved; row 3 stays unused."""
+    params = Params(time_step=1.0, truth_process_noise=0.0, death_probability=0.2, birth_rate=1.0)
+    state = jnp.zeros((4, 6)).at[:, 0].set(2000.0).at[:, 1].set(10.0)
+    truths = Truths(state=state, alive=jnp.arange(4) < 2)
+    # P(0 births) = 0.37 and P(at most 1) = 0.74 at rate 1.
+    noise = draws(4, death=jnp.array([0.1, 0.2, 0.0, 0.0]), birth_count=0.5)
+    after, num_born = propagate(truths, jnp.asarray(2), noise, 1, params)
+    np.testing.assert_array_equal(after.alive, [False, True, True, False])
+    assert int(num_born) == 3
+    assert float(after.state[1, 0]) == 2010.0
+    # Draws of zero are the middle of the field at rest.
+    middle = (params.min_range + params.max_range) / 2
+    np.testing.assert_allclose(after.state[2], [middle, 0, 0, 0, 0, 0], atol=1e-3)
+
+
+def test_the_row_of_a_dead_truth_is_not_used_again():
+    params = Params(birth_rate=1.0)
+    truths = Truths(state=jnp.zeros((3, 6)), alive=jnp.array([False, True, True]))
+    after, num_born = propagate(truths, jnp.asarray(3), draws(3, birth_count=0.9), 1, params)
+    np.testing.assert_array_equal(after.alive, truths.alive)
+    assert int(num_born) == 5  # two births that found no row
+
+
+def test_births_and_deaths_are_as_frequent_as_asked():
+    params = Params(birth_rate=0.7, death_probability=0.1, initial_truths=3000)
+    truths = initiate(jax.random.key(0), MANY, params)
+    keys = jax.random.split(jax.random.key(1), 200)
+
+    def step(carry, key):
+        noise = sample_truth_noise(key, jax.random.fold_in(key, 1), MANY.num_truths)
+        truths, num_born = propagate_truths(*carry, noise, 1, params)
+        return (truths, num_born), (jnp.sum(carry[0].alive), jnp.sum(truths.alive), num_born)
+
+    before, after, num_born = jax.jit(lambda: jax.lax.scan(step, (truths, 3000), keys)[1])()
+    births = np.diff(num_born, prepend=3000)
+    deaths = before + births - after
+    assert abs(births.mean() - 0.7) < 4 * np.sqrt(0.7 / 200)
+    assert abs(deaths.sum() / before.sum() - 0.1) < 4 * np.sqrt(0.09 / before.sum())
+
+
+def test_newborns_are_placed_as_at_the_start(born, params):
+    """The same law through the normal draws of motion."""
+    crowd = params.replace(birth_rate=80.0)
+    nobody = Truths(state=jnp.zeros((50, 6)), alive=jnp.zeros(50, dtype=bool))
+    motion = jax.random.normal(jax.random.key(5), (80, 50, 3, 2))
+
+    def begin(motion):
+        return begin_truths(nobody, jnp.asarray(0), draws(50, motion, birth_count=0.9), crowd)[0]
+
+    later = jax.tree.map(lambda leaf: leaf.reshape(4000, *leaf.shape[2:]), jax.vmap(begin)(motion))
+    assert bool(jnp.all(later.alive))
+    first, second = (np.asarray(spherical(position(truths.state))) for truths in (born, later))
+    for quantity in range(3):
+        levels = np.linspace(0.05, 0.95, 10)
+        spread = first[:, quantity].max() - first[:, quantity].min()
+        gap = np.quantile(first[:, quantity], levels) - np.quantile(second[:, quantity], levels)
+        assert np.abs(gap).max() < 0.05 * spread
+    np.testing.assert_allclose(velocity(later.state).std(), params.truth_velocity_sigma, rtol=0.03)

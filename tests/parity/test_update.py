@@ -29,7 +29,7 @@ from reference.translate import as_vector, to_detections
 NOW = datetime.datetime(2000, 1, 1)
 EXPECT = jax.jit(kalman.predict_detections)
 UPDATE = jax.jit(kalman.update)
-MEASURE = jax.jit(association.mahalanobis_distances)
+MEASURE = jax.jit(association.mahalanobis)
 DIRECTIONS = pytest.mark.parametrize("towards", [AHEAD, BEHIND, UP], ids=["ahead", "behind", "up"])
 
 
@@ -131,7 +131,7 @@ def test_distance_and_posterior(towards):
     predicted = track_list(mean, covariance)
     expected = EXPECT(predicted, params)
     detections = Detections.from_values(value)
-    distances = MEASURE(expected, detections)
+    distances = MEASURE(expected, detections, params)
     stone_soup = to_detections(value, np.ones(10, bool), 1, NOW, parts.measurement_model)
     for row in range(10):
         updated = UPDATE(predicted, expected, detections, jnp.full(10, row))

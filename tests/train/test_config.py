@@ -106,6 +106,9 @@ def test_the_folder_of_a_run_is_new(tmp_path):
     assert not (tmp_path / "new").exists()
 
 
+CHOICES = {"reward": "as_printed", "measure": "hellinger"}
+
+
 def changed(config):
     """The configuration with every number, word and choice different from the default."""
     fields = {}
@@ -113,8 +116,8 @@ def changed(config):
         value = getattr(config, field.name)
         if dataclasses.is_dataclass(value):
             fields[field.name] = changed(value)
-        elif field.name == "reward":
-            fields[field.name] = "as_printed"
+        elif field.name in CHOICES:
+            fields[field.name] = CHOICES[field.name]
         elif isinstance(value, str):
             fields[field.name] = value + "other"
         elif value is not None:
