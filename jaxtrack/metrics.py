@@ -7,45 +7,186 @@ from flax import struct
 
 from jaxtrack.observation import covariance_norms
 from jaxtrack.params import Params
-from jaxtrack.types import Tracks, Truths, position
+from jaxtrack.types import NEVER, NO_DETECTION, Tracks, Truths, position
+
+_NO_SLOT = -1
+_NO_STEP = -1
 
 
 class Gospa(struct.PyTreeNode):
     """GOSPA with alpha = 2 (Stone Soup's `GOSPAMetric`), positions only.
 
-    The three parts are p-th powers; ``distance = (localisation + missed + false)^(1/p)``.
+    The three parts are p-th powers. Without switching, ``distance = (localisation + missed +
+    false)^(1/p)``; with it, ``distance = sqrt(distance^2 + switching^2)`` whatever p is, as
+    Stone Soup has it.
 
     Attributes:
         distance: the metric (m).
         localisation: sum of d^p over assigned pairs closer than the cut-off (m^p).
         missed: c^p/2 for every truth without a track (m^p).
         false: c^p/2 for every track without a truth (m^p).
+        switching: penalty for truths whose track changed (m); 0 for a single step.
     """
 
     distance: jax.Array
     localisation: jax.Array
     missed: jax.Array
     false: jax.Array
+    switching: jax.Array
+
+
+class GospaHistory(struct.PyTreeNode):
+    """Which track every truth was last assigned to, for the switching penalty.
+
+    Attributes:
+        seen: `[N]` whether the truth was ever assigned a track.
+        birth_step: `[N]` birth step of its track, `NEVER` where it has none now.
+        birth_detection: `[N]` birth detection of its track, `NO_DETECTION` where it has none now.
+    """
+
+    seen: jax.Array  # [N] bool
+    birth_step: jax.Array  # [N] int
+    birth_detection: jax.Array  # [N] int
+
+    @classmethod
+    def empty(cls, num_truths: int) -> "GospaHistory":
+        """Before the first step."""
+        return cls(
+            seen=jnp.zeros(num_truths, dtype=bool),
+            birth_step=jnp.full(num_truths, NEVER, dtype=int),
+            birth_detection=jnp.full(num_truths, NO_DETECTION, dtype=int),
+        )
 
 
 def position_distances(truths: Truths, tracks: Tracks) -> jax.Array:
     """Distances `[N, T]` (m) of every truth from every track; infinite where one is absent."""
-    offsets = position(truths.state)[:, None] - position(tracks.mean)[None]
-    distances = jnp.sqrt(jnp.sum(offsets**2, axis=-1))
+    distances = pairwise_distances(position(truths.state), position(tracks.mean))
     return jnp.where(truths.alive[:, None] & tracks.active[None], distances, jnp.inf)
 
 
+def pairwise_distances(a: jax.Array, b: jax.Array) -> jax.Array:
+    """Euclidean distances `[N, T]` of vectors `[N, 3]` from vectors `[T, 3]`."""
+    return jnp.sqrt(jnp.sum((a[:, None] - b[None]) ** 2, axis=-1))
+
+
 def gospa(truths: Truths, tracks: Tracks, params: Params) -> Gospa:
-    """GOSPA between truths and live tracks by an exact assignment."""
+    """GOSPA between truths and live tracks of one step, by an exact assignment."""
+    return _gospa(truths, tracks, params)[0]
+
+
+def gospa_step(
+    history: GospaHistory, truths: Truths, tracks: Tracks, params: Params
+) -> tuple[GospaHistory, Gospa]:
+    """GOSPA of the next step of a record, switching penalty included.
+
+    Stone Soup's `GOSPAMetric.compute_over_time`: a truth that passes from one track to another
+    counts 1, one that gains or loses its track 1/2 (its first track is free), and the penalty
+    is ``gospa_switching_penalty * count^(1/p)``. A truth that is absent, and every truth on a
+    step without a single track, keeps its history and counts nothing.
+
+    Args:
+        history: `GospaHistory.empty(N)` before the first step.
+        truths: the truths of this step; a row is one truth for the whole record.
+        tracks: the tracks of this step, recognised by birth step and birth detection.
+        params: numbers of the metric.
+
+    Returns:
+        The history after this step, and the metric.
+    """
+    single, slot = _gospa(truths, tracks, params)
+    has_track = slot != _NO_SLOT
+    birth_step = jnp.where(has_track, tracks.birth_step[slot], NEVER)
+    birth_detection = jnp.where(has_track, tracks.birth_detection[slot], NO_DETECTION)
+    counts = truths.alive & jnp.any(tracks.active)
+
+    had_track = history.birth_step != NEVER
+    same = (birth_step == history.birth_step) & (birth_detection == history.birth_detection)
+    changed = counts & history.seen & ~same
+    switches = (jnp.sum(changed) + jnp.sum(changed & has_track & had_track)) / 2
+    switching = params.gospa_switching_penalty * switches ** (1 / params.gospa_order)
+
+    history = GospaHistory(
+        seen=history.seen | (counts & has_track),
+        birth_step=jnp.where(counts, birth_step, history.birth_step),
+        birth_detection=jnp.where(counts, birth_detection, history.birth_detection),
+    )
+    distance = jnp.sqrt(single.distance**2 + switching**2)
+    return history, single.replace(distance=distance, switching=switching)
+
+
+def gospa_over_time(truths: Truths, tracks: Tracks, params: Params) -> Gospa:
+    """GOSPA `[K]` of every step of a record, switching penalty included (see `gospa_step`).
+
+    Args:
+        truths: `[K, N, ...]`.
+        tracks: `[K, T, ...]`.
+        params: numbers of the metric.
+    """
+
+    def step(history: GospaHistory, now: tuple[Truths, Tracks]) -> tuple[GospaHistory, Gospa]:
+        return gospa_step(history, *now, params)
+
+    start = GospaHistory.empty(truths.alive.shape[1])
+    return jax.lax.scan(step, start, (truths, tracks))[1]
+
+
+def _gospa(truths: Truths, tracks: Tracks, params: Params) -> tuple[Gospa, jax.Array]:
+    """GOSPA of one step, and the slot `[N]` assigned to every truth, or `_NO_SLOT`."""
     c, p = params.gospa_cutoff, params.gospa_order
-    costs = jnp.minimum(position_distances(truths, tracks), c) ** p
-    rows, columns = optax.assignment.hungarian_algorithm(costs)
-    assigned = costs[rows, columns]
-    close = assigned < c**p
-    localisation = jnp.sum(jnp.where(close, assigned, 0.0))
+    distances = jnp.minimum(position_distances(truths, tracks), c)
+    rows, columns = optax.assignment.hungarian_algorithm(distances**p)
+    assigned = distances[rows, columns]
+    close = assigned < c
+    localisation = jnp.sum(jnp.where(close, assigned**p, 0.0))
     missed = (jnp.sum(truths.alive) - jnp.sum(close)) * c**p / 2
     false = (jnp.sum(tracks.active) - jnp.sum(close)) * c**p / 2
-    return Gospa((localisation + missed + false) ** (1 / p), localisation, missed, false)
+    distance = (localisation + missed + false) ** (1 / p)
+    slot = jnp.full(truths.alive.shape, _NO_SLOT).at[rows].set(jnp.where(close, columns, _NO_SLOT))
+    return Gospa(distance, localisation, missed, false, jnp.zeros_like(distance)), slot
+
+
+class BasicMetrics(struct.PyTreeNode):
+    """How many tracks and truths a record holds (Stone Soup's `BasicMetrics`).
+
+    Attributes:
+        num_tracks: distinct tracks that ever lived.
+        num_truths: truths that ever lived; Stone Soup's "Number of targets".
+        track_to_target_ratio: the first by the second. Deletion and re-initiation raise it.
+        mean_ratio: live tracks by living truths, averaged over the steps with a truth; not in
+            Stone Soup.
+    """
+
+    num_tracks: jax.Array
+    num_truths: jax.Array
+    track_to_target_ratio: jax.Array
+    mean_ratio: jax.Array
+
+
+def basic_metrics(truths: Truths, tracks: Tracks) -> BasicMetrics:
+    """Counts of a record: truths `[K, N, ...]` and tracks `[K, T, ...]`; without a truth, per 1."""
+    num_tracks = jnp.sum(begins(tracks))
+    num_truths = jnp.sum(jnp.any(truths.alive, axis=0))
+    alive, active = jnp.sum(truths.alive, axis=-1), jnp.sum(tracks.active, axis=-1)
+    ratios = jnp.where(alive > 0, active / jnp.maximum(alive, 1), 0.0)
+    return BasicMetrics(
+        num_tracks=num_tracks,
+        num_truths=num_truths,
+        track_to_target_ratio=num_tracks / jnp.maximum(num_truths, 1),
+        mean_ratio=jnp.sum(ratios) / jnp.maximum(jnp.sum(alive > 0), 1),
+    )
+
+
+def begins(tracks: Tracks) -> jax.Array:
+    """`[K, T]` whether a slot of a record `[K, T, ...]` holds a track that it did not hold before.
+
+    A slot may hold one track after another: they differ in birth step or birth detection.
+    """
+    steps = jnp.arange(tracks.active.shape[0])[:, None]
+    last = jax.lax.cummax(jnp.where(tracks.active, steps, _NO_STEP), axis=0)
+    before = jnp.concatenate([jnp.full_like(last[:1], _NO_STEP), last[:-1]])
+    births = jnp.stack([tracks.birth_step, tracks.birth_detection], axis=-1)
+    earlier = jnp.take_along_axis(births, jnp.maximum(before, 0)[..., None], axis=0)
+    return tracks.active & ((before == _NO_STEP) | jnp.any(births != earlier, axis=-1))
 
 
 def completeness(truths: Truths, tracks: Tracks, params: Params) -> jax.Array:

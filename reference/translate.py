@@ -6,7 +6,7 @@ always written in the order of these keys.
 """
 
 import datetime
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 import jax.numpy as jnp
 import numpy as np
@@ -14,6 +14,7 @@ from stonesoup.models.measurement.nonlinear import CartesianToElevationBearingRa
 from stonesoup.types.angle import Bearing, Elevation
 from stonesoup.types.array import StateVector
 from stonesoup.types.detection import Detection
+from stonesoup.types.groundtruth import GroundTruthPath, GroundTruthState
 from stonesoup.types.hypothesis import SingleHypothesis
 from stonesoup.types.state import GaussianState, State
 from stonesoup.types.track import Track
@@ -131,3 +132,39 @@ def _track(mean: np.ndarray, covariance: np.ndarray, key: TrackKey, time: dateti
             )
         ]
     )
+
+
+def to_track_histories(tracks: Tracks, times: Sequence[datetime.datetime]) -> dict[TrackKey, Track]:
+    """Whole Stone Soup tracks of a record `[K, T, ...]`, one for every key that it holds.
+
+    Args:
+        tracks: the record; slots may hold one track after another.
+        times: time of every step.
+    """
+    active, mean = np.asarray(tracks.active), np.asarray(tracks.mean, float)
+    covariance = np.asarray(tracks.covariance, float)
+    births = np.stack([tracks.birth_step, tracks.birth_detection], axis=-1)
+    histories: dict[TrackKey, Track] = {}
+    for step, slot in np.argwhere(active):
+        birth_step, birth_detection = births[step, slot]
+        key, estimate = (int(birth_step), int(birth_detection)), (mean[step, slot], covariance[step, slot])
+        if key in histories:
+            state = GaussianState(StateVector(estimate[0]), estimate[1], timestamp=times[step])
+            histories[key].append(state)
+        else:
+            histories[key] = _track(*estimate, key, times[step])
+    return histories
+
+
+def to_ground_truth_paths(truths: Truths, times: Sequence[datetime.datetime]) -> dict[int, GroundTruthPath]:
+    """Stone Soup paths of a record `[K, N, ...]`, by row; rows that never live have none."""
+    alive, state = np.asarray(truths.alive), np.asarray(truths.state, float)
+    return {
+        int(row): GroundTruthPath(
+            [
+                GroundTruthState(StateVector(state[step, row]), timestamp=times[step])
+                for step in np.flatnonzero(alive[:, row]).tolist()
+            ]
+        )
+        for row in np.flatnonzero(alive.any(axis=0))
+    }
