@@ -1,6 +1,8 @@
-"""One line of the parity table."""
+"""One line of the parity table, and the tally that it is made from."""
 
 import dataclasses
+
+import numpy as np
 
 
 @dataclasses.dataclass(frozen=True)
@@ -19,6 +21,8 @@ class Row:
             the initiator plays no part.
         agreement: share of decisions (gate, association, birth, deletion) that are the same
             outside exact ties; None where nothing is decided.
+        agreement32: the same in single precision.
+        agreement_stock: the same against the bare stock initiator.
         ties: exact ties met, which are left out.
         tolerance: largest error in float64 that passes.
         note: what a reader must know of this row.
@@ -32,6 +36,8 @@ class Row:
     float32: float | None = None
     stock: float | None = None
     agreement: float | None = None
+    agreement32: float | None = None
+    agreement_stock: float | None = None
     ties: int = 0
     tolerance: float = 1e-9
     note: str = ""
@@ -41,3 +47,28 @@ class Row:
         """Whether something was compared, the error is within tolerance and every decision agrees."""
         small = self.float64 is None or self.float64 <= self.tolerance
         return self.compared > 0 and small and self.agreement in (None, 1.0)
+
+
+class Tally:
+    """Errors and decisions of one component, collected in one precision or variant."""
+
+    def __init__(self) -> None:
+        self.compared = 0
+        self.largest: float | None = None
+        self.same = 0
+        self.decided = 0
+
+    def error(self, value: float) -> None:
+        """Takes one result's error; NaN stays and fails every tolerance."""
+        self.compared += 1
+        self.largest = float(np.maximum(value, 0.0 if self.largest is None else self.largest))
+
+    def decision(self, same: bool) -> None:
+        """Takes one decision."""
+        self.decided += 1
+        self.same += bool(same)
+
+    @property
+    def agreement(self) -> float | None:
+        """Share of the decisions that agree; None without any."""
+        return self.same / self.decided if self.decided else None
