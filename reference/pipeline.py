@@ -1,5 +1,6 @@
 """One step of the stock tracker at a time, with every intermediate on record."""
 
+import datetime
 from dataclasses import dataclass
 
 import numpy as np
@@ -112,22 +113,27 @@ class StoneSoupTracker:
         updated_by = {key: record.source(key) for key in record.live} if record else {}
         return to_tracks(self.tracks, self.index, max_tracks, updated_by)
 
-    def step(self, value: np.ndarray, active: np.ndarray | None = None) -> StepRecord:
+    def step(
+        self, value: np.ndarray, active: np.ndarray | None = None, time: datetime.datetime | None = None
+    ) -> StepRecord:
         """One step of the stock tracker.
 
         Args:
             value: `[D, 3]` elevation, bearing (rad), range (m).
             active: `[D]` which rows hold a detection; all if not given.
+            time: when; one `params.time_step` after the other if not given.
         """
         self.index += 1
         active = np.ones(len(value), dtype=bool) if active is None else np.asarray(active)
-        time = time_of(self.index, self.params)
+        time = time_of(self.index, self.params) if time is None else time
         model = self.components.measurement_model
         detections = to_detections(np.asarray(value, float), active, self.index, time, model)
         before = {track_key(track): track for track in self.tracks}
         expected = {}
         if self.intermediates:
-            expected = {key: self.expect(track, detections, len(value)) for key, track in before.items()}
+            expected = {
+                key: self.expect(track, detections, len(value), time) for key, track in before.items()
+            }
 
         self.tracker.update_tracker(time, set(detections))
 
@@ -146,10 +152,11 @@ class StoneSoupTracker:
             live={key: estimate(track) for key, track in after.items()},
         )
 
-    def expect(self, track: Track, detections: list[Detection], rows: int) -> Expected:
-        """Predicts one track to the present step and measures it against all detections."""
+    def expect(
+        self, track: Track, detections: list[Detection], rows: int, time: datetime.datetime
+    ) -> Expected:
+        """Predicts one track to the time of the present step and measures it against all detections."""
         parts = self.components
-        time = time_of(self.index, self.params)
         prediction = parts.predictor.predict(track, timestamp=time)
         measured = parts.updater.predict_measurement(prediction, parts.measurement_model)
         distances = np.full(rows, np.nan)

@@ -1,0 +1,193 @@
+"""The tracker on a file of detections.
+
+    python -m jaxtrack.track DETECTIONS.csv --out TRACKS.csv
+
+As a function: `jaxtrack.tracking.track_scans`.
+"""
+
+import dataclasses
+import math
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import tyro
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
+
+from jaxtrack.cli import INTERRUPTED, parse, run, take_config
+from jaxtrack.detection_file import RecordedDetections, read_detections
+from jaxtrack.params import Params, StaticParams, validate
+from jaxtrack.track_file import TrackWriter, partial_path
+from jaxtrack.track_plot import SUFFIXES, TrackPaths
+from jaxtrack.tracking import track_scans
+
+TRACKER_FIELDS = (
+    "elevation_sigma",
+    "bearing_sigma",
+    "range_sigma",
+    "process_noise",
+    "alpha",
+    "beta",
+    "kappa",
+    "gate_threshold",
+    "missed_distance",
+    "prior_velocity_sigma",
+    "deletion_threshold",
+)
+"""The fields of `Params` that the tracker uses on recorded detections."""
+
+HELP = """\
+Runs the tracker over recorded detections.
+It reads the columns time, elevation, bearing, range (s, rad, rad, m), in any order; others are ignored.
+Rows of equal time (to the microsecond) are one scan; a row with only a time is an empty scan.
+Intervals may be uneven, and times as large as seconds since 1970.
+It writes one row for each live track and scan: time, track (0, 1, ... in order of birth), x, vx, y, vy,
+z, vz (m, m/s), the upper triangle p00, p01, ... p55 of their covariance, and detection (row within the
+scan, from 0; empty where the scan had none for the track).
+--config FILE (.toml or .json) sets numbers of the tracker; --set wins over it. They are, with defaults:
+"""
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """What the command is to do."""
+
+    detections: tyro.conf.Positional[Path] = tyro.MISSING
+    """CSV file to read."""
+    out: Path = tyro.MISSING
+    """CSV file to write."""
+    set: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
+    """A number of the tracker as name=value, from the list above."""
+    plot: Path | None = None
+    """Picture of the tracks to draw: .png, .pdf or .svg."""
+
+
+def main(argv: Sequence[str]) -> int:
+    """The command; returns the exit code."""
+    values, rest = take_config(argv)
+    options = parse(Options(), rest, "python -m jaxtrack.track", help_text())
+    params = build_params({**values, **read_settings(options.set)})
+    check_files(options)
+    with jax.enable_x64(True):
+        recorded = read_detections(options.detections)
+        if recorded.ignored:
+            print(f"{options.detections}: ignored columns {', '.join(recorded.ignored)}", file=sys.stderr)
+        return track_file(recorded, params, options)
+
+
+def track_file(recorded: RecordedDetections, params: Params, options: Options) -> int:
+    """Tracks, writes, draws, and says in one line what was done; returns the exit code."""
+    started, scans, tracks, compiling = time.perf_counter(), 0, 0, 0.0
+    paths = TrackPaths(recorded) if options.plot else None
+    try:
+        with TrackWriter(options.out, recorded.label) as writer, _progress() as progress:
+            task = progress.add_task("tracking", total=len(recorded.time), speed="")
+            for rows in track_scans(recorded, params):
+                writer.write(rows)
+                if paths:
+                    paths.add(rows)
+                scans, tracks, compiling = rows.scans.stop, rows.tracks_born, rows.compile_seconds
+                speed = scans / (time.perf_counter() - started - compiling)
+                progress.update(task, completed=scans, speed=f"{speed:,.0f} scans/s")
+    except KeyboardInterrupt:
+        print(
+            f"interrupted: the first {scans} of {len(recorded.time)} scans are in {writer.partial}",
+            file=sys.stderr,
+        )
+        return INTERRUPTED
+    seconds = time.perf_counter() - started - compiling
+    print(
+        f"{options.out}: scans {scans:,}, detections {len(recorded.value):,}, tracks {tracks:,}; "
+        f"{seconds:.1f} s, {scans / seconds:,.0f} scans/s, after compiling for {compiling:.1f} s"
+    )
+    if paths and options.plot:
+        paths.save(options.plot)
+    return 0
+
+
+def build_params(values: dict[str, Any]) -> Params:
+    """The tracker's numbers with these changed.
+
+    Raises:
+        ValueError: naming a field that the tracker does not use, or a value out of range.
+    """
+    for name, value in values.items():
+        if name not in TRACKER_FIELDS:
+            raise ValueError(f"{name}: no number of the tracker; expected one of {', '.join(TRACKER_FIELDS)}")
+        if isinstance(value, (bool, list, dict)) or value is None:
+            raise ValueError(f"{name} = {value!r}: expected a number")
+    params = Params(**values)
+    validate(StaticParams(), params)
+    numbers: dict[str, Any] = {name: float(value) for name, value in values.items()}
+    return dataclasses.replace(params, **numbers)
+
+
+def read_settings(settings: Sequence[str]) -> dict[str, str]:
+    """Names and values of `--set`.
+
+    Raises:
+        ValueError: naming one that has no equals sign.
+    """
+    for setting in settings:
+        if "=" not in setting:
+            raise ValueError(f"set = {setting!r}: expected name=value, such as process_noise=10")
+    return {name.strip(): value.strip() for name, _, value in (s.partition("=") for s in settings)}
+
+
+def check_files(options: Options) -> None:
+    """Raises ValueError, naming the option, for a file that can not be written or would be lost."""
+    taken = [("detections", options.detections.resolve())]
+    for name, path in (("out", options.out), ("plot", options.plot)):
+        if path is None:
+            continue
+        if path.is_dir() or not path.parent.is_dir():
+            raise ValueError(f"{name} = {str(path)!r}: expected a file in a folder that exists")
+        for other, known in taken:
+            if known in (path.resolve(), partial_path(path).resolve()):
+                raise ValueError(f"{name} = {str(path)!r}: is the file of {other}, which would be lost")
+        taken.append((name, path.resolve()))
+    if options.plot and options.plot.suffix not in SUFFIXES:
+        raise ValueError(f"plot = {str(options.plot)!r}: expected a name that ends in {', '.join(SUFFIXES)}")
+
+
+def help_text() -> str:
+    """What the command does, and the list of the tracker's numbers."""
+    lines = [HELP]
+    for field in dataclasses.fields(Params):
+        if field.name in TRACKER_FIELDS:
+            low, high = field.metadata["low"], field.metadata["high"]
+            bracket = "(" if field.metadata["open_low"] else "["
+            end = ")" if math.isinf(high) else "]"
+            unit = "" if field.metadata["unit"] == "1" else f" {field.metadata['unit']}"
+            lines.append(f"  {field.name} = {field.default:g}{unit}, in {bracket}{low:g}, {high:g}{end}")
+    return "\n".join(lines)
+
+
+def _progress() -> Progress:
+    return Progress(
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TextColumn("{task.fields[speed]}"),
+        TimeElapsedColumn(),
+        TextColumn("left"),
+        TimeRemainingColumn(),
+        console=Console(stderr=True),
+        disable=not sys.stderr.isatty(),
+        transient=True,
+    )
+
+
+if __name__ == "__main__":
+    run(main)
