@@ -7,7 +7,7 @@ from flax import struct
 
 from jaxtrack.observation import covariance_norms
 from jaxtrack.params import Params
-from jaxtrack.types import NEVER, NO_DETECTION, Tracks, Truths, position
+from jaxtrack.types import Tracks, Truths, position
 
 _NO_SLOT = -1
 _NO_STEP = -1
@@ -40,22 +40,21 @@ class GospaHistory(struct.PyTreeNode):
 
     Attributes:
         seen: `[N]` whether the truth was ever assigned a track.
-        birth_step: `[N]` birth step of its track, `NEVER` where it has none now.
-        birth_detection: `[N]` birth detection of its track, `NO_DETECTION` where it has none now.
+        has_track: `[N]` whether it was on the last step that counted.
+        birth_step: `[N]` birth step of that track.
+        birth_detection: `[N]` birth detection of that track.
     """
 
     seen: jax.Array  # [N] bool
+    has_track: jax.Array  # [N] bool
     birth_step: jax.Array  # [N] int
     birth_detection: jax.Array  # [N] int
 
     @classmethod
     def empty(cls, num_truths: int) -> "GospaHistory":
         """Before the first step."""
-        return cls(
-            seen=jnp.zeros(num_truths, dtype=bool),
-            birth_step=jnp.full(num_truths, NEVER, dtype=int),
-            birth_detection=jnp.full(num_truths, NO_DETECTION, dtype=int),
-        )
+        no, nothing = jnp.zeros(num_truths, dtype=bool), jnp.zeros(num_truths, dtype=int)
+        return cls(no, no, nothing, nothing)
 
 
 def position_distances(truths: Truths, tracks: Tracks) -> jax.Array:
@@ -95,18 +94,18 @@ def gospa_step(
     """
     single, slot = _gospa(truths, tracks, params)
     has_track = slot != _NO_SLOT
-    birth_step = jnp.where(has_track, tracks.birth_step[slot], NEVER)
-    birth_detection = jnp.where(has_track, tracks.birth_detection[slot], NO_DETECTION)
+    birth_step, birth_detection = tracks.birth_step[slot], tracks.birth_detection[slot]
     counts = truths.alive & jnp.any(tracks.active)
 
-    had_track = history.birth_step != NEVER
-    same = (birth_step == history.birth_step) & (birth_detection == history.birth_detection)
-    changed = counts & history.seen & ~same
-    switches = (jnp.sum(changed) + jnp.sum(changed & has_track & had_track)) / 2
+    passed = (birth_step != history.birth_step) | (birth_detection != history.birth_detection)
+    passed = counts & has_track & history.has_track & passed
+    gained_or_lost = counts & history.seen & (has_track != history.has_track)
+    switches = jnp.sum(passed) + jnp.sum(gained_or_lost) / 2
     switching = params.gospa_switching_penalty * switches ** (1 / params.gospa_order)
 
     history = GospaHistory(
         seen=history.seen | (counts & has_track),
+        has_track=jnp.where(counts, has_track, history.has_track),
         birth_step=jnp.where(counts, birth_step, history.birth_step),
         birth_detection=jnp.where(counts, birth_detection, history.birth_detection),
     )

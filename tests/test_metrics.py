@@ -9,9 +9,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from jaxtrack import Params, metrics
+from jaxtrack import Params, Tracks, Truths, metrics
 
 gospa = jax.jit(metrics.gospa)
+gospa_over_time = jax.jit(metrics.gospa_over_time)
 PARAMS = Params(gospa_cutoff=100.0, gospa_order=2.0, deletion_threshold=5000.0)
 
 
@@ -128,3 +129,107 @@ def test_distances_ignore_velocity(scene):
     truths, tracks = scene([3.0], [0.0])
     tracks = tracks.replace(mean=jnp.array([[0.0, 50.0, 4.0, 50.0, 12.0, 50.0]]))
     np.testing.assert_allclose(metrics.position_distances(truths, tracks), [[13.0]], rtol=1e-6)
+
+
+def over_time(scene, tracks, births, alive=None, **numbers):
+    """GOSPA over time with tracks [K, T] on the x axis, one truth at 0, and birth steps [K, T].
+
+    A birth step of -1 is an empty slot.
+    """
+    steps = []
+    for row, (at, born) in enumerate(zip(tracks, births, strict=True)):
+        here = True if alive is None else alive[row]
+        truth, track_list = scene([0.0], at, [here], [step >= 0 for step in born])
+        steps.append((truth, track_list.replace(birth_step=jnp.array(born))))
+    record = jax.tree.map(lambda *leaves: jnp.stack(leaves), *steps)
+    return gospa_over_time(*record, PARAMS.replace(gospa_switching_penalty=50.0, **numbers))
+
+
+def test_a_change_of_track_costs_the_penalty_once(scene):
+    result = over_time(scene, [[10.0]] * 4, [[0], [0], [2], [2]])
+    np.testing.assert_allclose(result.switching, [0, 0, 50, 0], atol=1e-6)
+    np.testing.assert_allclose(result.distance, [10, 10, np.hypot(10, 50), 10], rtol=1e-5)
+
+
+def test_tracks_born_on_one_step_differ_by_their_detection(scene):
+    truth, tracks = scene([0.0], [10.0])
+    first, second = (tracks.replace(birth_detection=jnp.array([row])) for row in (0, 1))
+    record = jax.tree.map(lambda *leaves: jnp.stack(leaves), (truth, first), (truth, second))
+    result = gospa_over_time(*record, PARAMS.replace(gospa_switching_penalty=50.0))
+    np.testing.assert_allclose(result.switching, [0, 50], atol=1e-6)
+
+
+def test_losing_and_regaining_a_track_cost_half_each_and_the_first_is_free(scene):
+    # 500 m is beyond the cut-off: the truth has no track, although one lives.
+    result = over_time(scene, [[500.0], [10.0], [500.0], [500.0], [10.0]], [[0]] * 5)
+    half = 50 * np.sqrt(0.5)
+    np.testing.assert_allclose(result.switching, [0, 0, half, 0, half], rtol=1e-6)
+
+
+def test_a_step_without_any_track_or_without_the_truth_keeps_the_history(scene):
+    # Not seeing a single track is not counted as losing one; coming back to the same is free.
+    result = over_time(scene, [[10.0]] * 3, [[0], [-1], [0]])
+    np.testing.assert_allclose(result.switching, 0, atol=1e-6)
+    result = over_time(scene, [[10.0]] * 3, [[0], [0], [5]], alive=[True, False, True])
+    np.testing.assert_allclose(result.switching, [0, 0, 50], atol=1e-6)
+
+
+def test_the_penalty_takes_the_order_but_joins_the_distance_squared(scene):
+    births = [[0, 1], [1, 0]]
+    result = over_time(scene, [[10.0, 300.0]] * 2, births, gospa_order=1.0)
+    # One truth, one track, one false track: 10 + 100 / 2.
+    np.testing.assert_allclose(result.distance, [60, np.hypot(60, 50)], rtol=1e-5)
+    two = over_time(scene, [[500.0], [10.0], [500.0]], [[0]] * 3, gospa_order=3.0)
+    np.testing.assert_allclose(two.switching, [0, 0, 50 * 0.5 ** (1 / 3)], rtol=1e-5)
+
+
+def test_an_empty_row_of_the_record_changes_no_switching(scene):
+    # The track moves from one slot to the other: it is the same one by its birth.
+    result = over_time(scene, [[10.0, np.nan], [np.nan, 10.0]], [[0, -1], [-1, 0]])
+    np.testing.assert_allclose(result.switching, 0, atol=1e-6)
+    np.testing.assert_allclose(result.distance, 10.0, rtol=1e-5)
+
+
+def test_a_single_step_has_no_switching(scene):
+    result = gospa(*scene([0.0], [10.0]), PARAMS.replace(gospa_switching_penalty=50.0))
+    assert float(result.switching) == 0.0
+    np.testing.assert_allclose(result.distance, 10.0, rtol=1e-5)
+
+
+@pytest.fixture
+def record():
+    """Four steps, three truths of which the last never lives, two slots with three tracks."""
+    alive = np.array([[1, 0, 0], [1, 1, 0], [1, 1, 0], [0, 0, 0]], dtype=bool)
+    active = np.array([[0, 0], [1, 0], [1, 1], [1, 1]], dtype=bool)
+    # Slot 0 holds one track, then on the last step another; slot 1 holds a third.
+    birth_step = np.array([[-1, -1], [1, -1], [1, 2], [3, 2]])
+    tracks = jax.vmap(lambda _: Tracks.empty(2))(jnp.arange(4))
+    truths = Truths(state=jnp.full((4, 3, 6), jnp.nan), alive=jnp.asarray(alive))
+    return truths, tracks.replace(active=jnp.asarray(active), birth_step=jnp.asarray(birth_step))
+
+
+def test_basic_metrics_count_distinct_tracks_and_truths_that_ever_lived(record):
+    result = jax.jit(metrics.basic_metrics)(*record)
+    assert (int(result.num_tracks), int(result.num_truths)) == (3, 2)
+    assert float(result.track_to_target_ratio) == 1.5
+    # 0/1, 1/2, 2/2; the last step has no truth.
+    np.testing.assert_allclose(result.mean_ratio, 0.5)
+
+
+def test_basic_metrics_of_an_empty_record_are_zero(record):
+    truths, tracks = jax.tree.map(jnp.zeros_like, record)
+    assert [float(value) for value in jax.tree.leaves(metrics.basic_metrics(truths, tracks))] == [0, 0, 0, 0]
+
+
+def test_a_slot_begins_anew_with_another_birth_only(record):
+    _, tracks = record
+    expected = [[0, 0], [1, 0], [0, 1], [1, 0]]
+    np.testing.assert_array_equal(metrics.begins(tracks), np.array(expected, dtype=bool))
+    # The same track after a gap is no new one; another detection of the same step is.
+    gap = tracks.replace(
+        active=jnp.array([[1, 1], [0, 0], [1, 1], [1, 1]], dtype=bool),
+        birth_step=jnp.array([[0, 0], [7, 7], [0, 0], [0, 0]]),
+        birth_detection=jnp.array([[0, 1], [5, 5], [0, 2], [0, 2]]),
+    )
+    expected = [[1, 1], [0, 0], [0, 1], [0, 0]]
+    np.testing.assert_array_equal(metrics.begins(gap), np.array(expected, dtype=bool))
