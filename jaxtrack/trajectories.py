@@ -130,7 +130,7 @@ def resample(
 ) -> np.ndarray:
     """States at even steps: `[num_steps + 1, N, 6]` for `Params.trajectories`, row 0 for the reset.
 
-    Between two reports the position is the cubic that has the reported positions and
+    From one report to the next the position is the cubic that has the reported positions and
     velocities (Hermite), and the velocity is its derivative. Nothing is extrapolated: NaN
     before the first report, after the last, and between reports more than `max_gap` apart or
     whose distance differs by more than `MAX_JUMP` from what the mean of both velocities gives
@@ -170,7 +170,9 @@ def in_view(trajectories: np.ndarray, field_limit: float, max_range: float) -> n
     That is beyond `max_range` (m), below the horizon, or outside `field_limit` (rad) in
     azimuth or elevation.
     """
-    elevation, azimuth, distance = np.moveaxis(np.asarray(elevation_bearing_range(jnp.asarray(trajectories))), -1, 0)
+    elevation, azimuth, distance = np.moveaxis(
+        np.asarray(elevation_bearing_range(jnp.asarray(trajectories))), -1, 0
+    )
     with np.errstate(invalid="ignore"):  # NaN is in no view
         seen = (elevation >= 0) & (elevation <= field_limit) & (abs(azimuth) <= field_limit)
         seen &= distance <= max_range

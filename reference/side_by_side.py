@@ -179,7 +179,7 @@ def _decisions(our: StepRecord, their: StepRecord) -> Iterator[tuple[str, Any, A
 def _worst_entry(step: int, key: TrackKey, a: Estimate, b: Estimate, errors: tuple[float, float]) -> str:
     """In words: the entry of one track's estimate that is furthest off in standard deviations."""
     sigma = np.sqrt(np.diag(b.covariance))
-    if not errors[0] <= errors[1]:
+    if np.argmax(errors) == 0:  # the first NaN, where there is one
         i = int(np.argmax(np.abs(a.mean - b.mean) / sigma))
         entry, ours, theirs = f"mean of {STATE_NAMES[i]}", a.mean[i], b.mean[i]
     else:
@@ -189,7 +189,7 @@ def _worst_entry(step: int, key: TrackKey, a: Estimate, b: Estimate, errors: tup
         ours, theirs = a.covariance[i, j], b.covariance[i, j]
     return (
         f"scan {step}, track {key}, {entry}: {float(ours)!r} in jaxtrack, {float(theirs)!r} in Stone Soup "
-        f"({max(errors):.1e} standard deviations apart)"
+        f"({np.max(errors):.1e} standard deviations apart)"
     )
 
 
