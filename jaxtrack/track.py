@@ -25,7 +25,7 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
-from jaxtrack.cli import INTERRUPTED, parse, run, take_config
+from jaxtrack.cli import parse, run, take_config
 from jaxtrack.detection_file import RecordedDetections, read_detections
 from jaxtrack.params import Params, StaticParams, validate
 from jaxtrack.track_file import TrackWriter, partial_path
@@ -83,11 +83,32 @@ def main(argv: Sequence[str]) -> int:
         recorded = read_detections(options.detections)
         if recorded.ignored:
             print(f"{options.detections}: ignored columns {', '.join(recorded.ignored)}", file=sys.stderr)
-        return track_file(recorded, params, options)
+        print(track_file(recorded, params, options))
+    return 0
 
 
-def track_file(recorded: RecordedDetections, params: Params, options: Options) -> int:
-    """Tracks, writes, draws, and says in one line what was done; returns the exit code."""
+@dataclasses.dataclass(frozen=True)
+class Summary:
+    """What was done, and how long it took (s)."""
+
+    out: Path
+    scans: int
+    detections: int
+    tracks: int
+    seconds: float
+    compile_seconds: float
+
+    def __str__(self) -> str:
+        """One line."""
+        return (
+            f"{self.out}: scans {self.scans:,}, detections {self.detections:,}, tracks {self.tracks:,}; "
+            f"{self.seconds:.1f} s, {self.scans / self.seconds:,.0f} scans/s, "
+            f"after compiling for {self.compile_seconds:.1f} s"
+        )
+
+
+def track_file(recorded: RecordedDetections, params: Params, options: Options) -> Summary:
+    """Tracks, writes, and draws; what is done stays in the partial file if it is interrupted."""
     started, scans, tracks, compiling = time.perf_counter(), 0, 0, 0.0
     paths = TrackPaths(recorded) if options.plot else None
     try:
@@ -101,19 +122,13 @@ def track_file(recorded: RecordedDetections, params: Params, options: Options) -
                 speed = scans / (time.perf_counter() - started - compiling)
                 progress.update(task, completed=scans, speed=f"{speed:,.0f} scans/s")
     except KeyboardInterrupt:
-        print(
-            f"interrupted: the first {scans} of {len(recorded.time)} scans are in {writer.partial}",
-            file=sys.stderr,
-        )
-        return INTERRUPTED
+        where = partial_path(options.out)
+        print(f"the first {scans} of {len(recorded.time)} scans are in {where}", file=sys.stderr)
+        raise
     seconds = time.perf_counter() - started - compiling
-    print(
-        f"{options.out}: scans {scans:,}, detections {len(recorded.value):,}, tracks {tracks:,}; "
-        f"{seconds:.1f} s, {scans / seconds:,.0f} scans/s, after compiling for {compiling:.1f} s"
-    )
     if paths and options.plot:
         paths.save(options.plot)
-    return 0
+    return Summary(options.out, scans, len(recorded.value), tracks, seconds, compiling)
 
 
 def build_params(values: dict[str, Any]) -> Params:

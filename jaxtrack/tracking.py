@@ -199,7 +199,7 @@ def _capacity(number: int) -> int:
 def _batch(recorded: RecordedDetections, first: int, chunk: int, state: Numbered) -> Scans:
     """The scans from `first` on, as many as one call takes; empty scans follow the last one."""
     bytes_each = _slots(state) * (STATE_DIM + 1) * STATE_DIM * 8
-    length = int(np.clip(CHUNK_BYTES // bytes_each, 1, chunk))
+    length = int(np.clip(CHUNK_BYTES // bytes_each, 1, min(chunk, _capacity(len(recorded.time)))))
     stop = min(first + length, len(recorded.time))
     counts = recorded.count[first:stop]
     capacity = _capacity(counts.max())
