@@ -1,6 +1,6 @@
 """What the agent sees, in numpy: the same numbers as `jaxtrack.observation` and `scan_map`."""
 
-from collections.abc import Iterable
+from collections.abc import Sequence
 
 import numpy as np
 from stonesoup.functions import cart2sphere
@@ -9,22 +9,35 @@ from stonesoup.types.track import Track
 from jaxtrack.observation import TRACK_FEATURES
 from jaxtrack.params import Params, StaticParams
 from jaxtrack.types import POSITION, VELOCITY
-from reference.translate import as_vector
+from reference.translate import as_vector, track_key
 
 
-def track_observation(
-    tracks: Iterable[Track], static: StaticParams, params: Params
-) -> tuple[np.ndarray, np.ndarray]:
-    """Scaled features `[T, 7]`, zero where there is no track, and mask `[T]`.
+class TrackSlots:
+    """Gives every track of Stone Soup's set a slot for life, as `jaxtrack.lifecycle` does.
 
-    Stone Soup's track list is a set: rows are in no special order. Tracks beyond the
-    capacity are left out.
+    Attributes:
+        tracks: the track in each slot, None where it is free.
     """
-    rows = [track_features(track) for track in tracks][: static.max_tracks]
-    features = np.zeros((static.max_tracks, TRACK_FEATURES))
-    if rows:
-        features[: len(rows)] = np.array(rows) / feature_scales(params)
-    return features, np.arange(static.max_tracks) < len(rows)
+
+    def __init__(self, max_tracks: int) -> None:
+        self.tracks: list[Track | None] = [None] * max_tracks
+
+    def update(self, live: set[Track]) -> None:
+        """Frees the slots of dead tracks, then gives new tracks, in order, the first free slots."""
+        self.tracks = [track if track in live else None for track in self.tracks]
+        waiting = sorted(live - set(self.tracks), key=track_key)
+        free = (slot for slot, track in enumerate(self.tracks) if track is None)
+        for slot, track in zip(list(free), waiting, strict=False):
+            self.tracks[slot] = track
+
+
+def track_observation(slots: Sequence[Track | None], params: Params) -> tuple[np.ndarray, np.ndarray]:
+    """Scaled features `[T, 7]`, zero where there is no track, and mask `[T]`."""
+    features = np.zeros((len(slots), TRACK_FEATURES))
+    for slot, track in enumerate(slots):
+        if track is not None:
+            features[slot] = track_features(track) / feature_scales(params)
+    return features, np.array([track is not None for track in slots])
 
 
 def track_features(track: Track) -> np.ndarray:

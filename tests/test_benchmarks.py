@@ -11,7 +11,8 @@ from rich.progress import Progress
 from benchmarks import environment, playing, report, stone_soup
 from benchmarks.environment import EnvironmentOptions
 from jaxtrack import Params, StaticParams, Truths, make, policies
-from reference.simulation import StoneSoupScenario, initial_states, truth_simulator
+from reference.simulation import StoneSoupScenario
+from reference.truths import initial_states, truth_simulator
 
 STATIC = StaticParams(num_truths=4, max_tracks=8, max_detections=4, map_size=12, num_looks=7)
 # Seven looks per axis cover the field only with a wide beam.
@@ -57,7 +58,7 @@ def test_looks_follow_the_same_rules_on_both_sides():
     env, params = make(PARAMS, STATIC)
     key = jax.random.key(0)
     _, state = env.reset(key, params)
-    states = initial_states(np.random.default_rng(1), STATIC, PARAMS)
+    states = initial_states(np.random.default_rng(1), STATIC.num_truths, PARAMS)
     scenario = StoneSoupScenario(STATIC, PARAMS)
     scenario.reset(seed=0)
     scenario.truths = iter(truth_simulator(states, 0, PARAMS))

@@ -5,12 +5,13 @@ import datetime
 import jax
 import numpy as np
 import pytest
+from stonesoup.sensor.radar.radar import RadarRotatingElevationBearingRange
 from stonesoup.types.groundtruth import GroundTruthState
 
 from jaxtrack import Params, StaticParams, Truths, models, sensor
 from reference.components import measurement_model
 from reference.parity.scenes import unit_vectors
-from reference.simulation import rotating_radar, steer
+from reference.radar import build_radar, steer
 from reference.translate import as_vector
 
 NOW = datetime.datetime(2000, 1, 1)
@@ -21,7 +22,7 @@ EDGE = 1e-9  # rad
 
 
 def radar_at(look, params):
-    radar = rotating_radar(params)
+    radar = build_radar(params, RadarRotatingElevationBearingRange)
     steer(radar, *look)
     return radar
 
