@@ -18,7 +18,7 @@ from benchmarks.report import circumstances, print_table
 from jaxtrack.cli import parse, run, wide_console
 from jaxtrack.detection_file import COLUMNS, RecordedDetections, read_detections
 from jaxtrack.params import Params
-from jaxtrack.track import Options, Summary, track_file
+from jaxtrack.track import Options, track_file
 from jaxtrack.tracking import TrackRows, track_scans
 from reference.parity.compare import TOLERANCE, covariance_error, mean_error
 from reference.pipeline import StepRecord, StoneSoupTracker
@@ -99,7 +99,7 @@ def write_file(path: Path, options: TrackingOptions) -> None:
                 return
 
 
-def time_ours(folder: Path, options: TrackingOptions) -> tuple[RecordedDetections, Summary, dict[str, Any]]:
+def time_ours(folder: Path, options: TrackingOptions) -> tuple[RecordedDetections, dict[str, Any]]:
     """Reads, tracks and writes as the command does."""
     source, out = folder / "detections.csv", folder / "tracks.csv"
     write_file(source, options)
@@ -109,7 +109,7 @@ def time_ours(folder: Path, options: TrackingOptions) -> tuple[RecordedDetection
     summary = track_file(recorded, PARAMS, Options(detections=source, out=out))
     seconds = read_seconds + summary.seconds
     kilobytes = 1024 if sys.platform == "darwin" else 1
-    return recorded, summary, {
+    return recorded, {
         "detections": summary.detections,
         "scans": summary.scans,
         "tracks": summary.tracks,
@@ -120,14 +120,13 @@ def time_ours(folder: Path, options: TrackingOptions) -> tuple[RecordedDetection
         "scans_per_second": summary.scans / seconds,
         "peak_memory_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1000 / kilobytes,
         "output_mb": out.stat().st_size / 1e6,
-    }  # fmt: skip
+    }
 
 
 def time_stone_soup(recorded: RecordedDetections, least_seconds: float) -> tuple[list[StepRecord], float]:
     """What the stock tracker did in the first scans, and how long it took (s)."""
     oracle, records, seconds = StoneSoupTracker(PARAMS, intermediates=False), list[StepRecord](), 0.0
-    starts = np.cumsum(recorded.count) - recorded.count
-    for microseconds, start, count in zip(recorded.time, starts, recorded.count, strict=True):
+    for microseconds, start, count in zip(recorded.time, recorded.start, recorded.count, strict=True):
         if seconds >= least_seconds:
             break
         moment = EPOCH + datetime.timedelta(microseconds=int(microseconds))
@@ -166,7 +165,7 @@ def largest_difference(chunks: Iterator[TrackRows], records: list[StepRecord]) -
 def measure(options: TrackingOptions) -> dict[str, Any]:
     """Both sides on the same file, and how far apart they are."""
     with jax.enable_x64(True), tempfile.TemporaryDirectory() as folder:
-        recorded, _, ours = time_ours(Path(folder), options)
+        recorded, ours = time_ours(Path(folder), options)
         records, seconds = time_stone_soup(recorded, options.stone_soup_seconds)
         difference = largest_difference(track_scans(recorded, PARAMS), records)
     detections = int(recorded.count[: len(records)].sum())

@@ -6,6 +6,7 @@ import math
 from array import array
 from collections.abc import Iterator, Sequence
 from datetime import timedelta
+from functools import cached_property
 from operator import itemgetter
 from pathlib import Path
 
@@ -38,6 +39,11 @@ class RecordedDetections:
     value: np.ndarray  # [N, 3] float64
     label: Sequence[str]
     ignored: Sequence[str] = ()
+
+    @cached_property
+    def start(self) -> np.ndarray:
+        """`[S]` row of `value` at which each scan begins."""
+        return np.cumsum(self.count) - self.count
 
     @classmethod
     def from_scans(cls, times: Sequence[float], scans: Sequence[np.ndarray]) -> "RecordedDetections":

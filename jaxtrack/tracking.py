@@ -138,11 +138,9 @@ def track_scans(recorded: RecordedDetections, params: Params, chunk: int = CHUNK
 
 
 class Made(struct.PyTreeNode):
-    """What one call makes; the shapes are those of `Tracks` after a leading K.
+    """The track list after each scan of one call, as in `Tracks` and `Numbered` with a leading K.
 
     Attributes:
-        tracks: the track list after each scan.
-        number: `[K, T]` number of each live track.
         num_dropped: `[K]` new tracks for which no slot was free.
     """
 
@@ -206,11 +204,11 @@ def _batch(recorded: RecordedDetections, first: int, chunk: int, state: Numbered
     active = np.zeros((length, capacity), dtype=bool)
     active[: stop - first] = np.arange(capacity) < counts[:, None]
     value = np.zeros((length, capacity, 3))
-    before = recorded.count[:first].sum()
-    value[active] = recorded.value[before : before + counts.sum()]
+    start = recorded.start[first]
+    value[active] = recorded.value[start : start + counts.sum()]
     time_step = np.zeros(length)
-    gaps = np.diff(recorded.time[max(first - 1, 0) : stop], prepend=recorded.time[:1] if first == 0 else [])
-    time_step[: stop - first] = gaps / MICROSECONDS
+    before = recorded.time[max(first - 1, 0)]
+    time_step[: stop - first] = np.diff(recorded.time[first:stop], prepend=before) / MICROSECONDS
     arrays = (value, active, time_step, np.arange(first, first + length))
     return Scans(*(jnp.asarray(array) for array in arrays))
 
