@@ -2,6 +2,8 @@
 
 import math
 import os
+import re
+from pathlib import Path
 
 import jax
 import numpy as np
@@ -308,3 +310,13 @@ def test_a_recorded_file():
         / 2
     )
     assert np.nanmedian(np.linalg.norm(straight, axis=-1)) < 20
+
+
+@pytest.mark.skipif(not REAL_FILE, reason="JAXTRACK_OPENSKY names no file")
+def test_the_pages_block_runs(tmp_path, monkeypatch, capsys):
+    page = Path(__file__).parents[1] / "docs" / "real_aircraft.md"
+    (block,) = re.findall(r"```python\n(.*?)```", page.read_text(), re.DOTALL)
+    monkeypatch.chdir(tmp_path)
+    exec(compile(block, str(page), "exec"), {"__name__": "__main__"})
+    assert "completeness" in capsys.readouterr().out
+    assert (tmp_path / "aircraft.png").stat().st_size > 10_000
