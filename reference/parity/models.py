@@ -207,9 +207,9 @@ def stock_distances(
             GaussianDetection(
                 found.state_vector, R, timestamp=EPOCH, measurement_model=parts.measurement_model
             )
-            for found in to_detections(value[slot], np.ones(4, bool), 0, EPOCH, parts.measurement_model)
+            for found in to_detections(value[slot], np.ones(4, bool), 0, EPOCH, model)
         ]
-        measured = parts.updater.predict_measurement(track, parts.measurement_model)
+        measured = parts.updater.predict_measurement(track, model)
         expected.append((as_vector(measured.state_vector), np.asarray(measured.covar, float)))
         hypotheses = parts.hypothesiser.hypothesise(track, detections, EPOCH)
         by_detection = {id(one.measurement): one.distance for one in hypotheses if one}
