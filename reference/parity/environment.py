@@ -1,6 +1,7 @@
 """Whole episodes of both environments from the same draws: observations and rewards."""
 
 import dataclasses
+from collections.abc import Iterable
 from functools import partial
 from typing import Any
 
@@ -17,13 +18,23 @@ from jaxtrack.truth import born_state
 from jaxtrack.types import Truths
 from reference.components import step_duration, transition_model
 from reference.gym_env import StoneSoupEnv
+from reference.parity.compare import TOLERANCE
 from reference.parity.episodes import Divergence
 from reference.parity.ours import cast
-from reference.parity.rows import Tally
+from reference.parity.rows import Row, Tally
+from reference.simulation import StoneSoupScenario
+from reference.translate import as_vector
 from reference.truths import Draws
 
 STATIC = StaticParams(num_truths=12, max_tracks=40, max_detections=20, map_size=24)
 """Roomy: Stone Soup has no capacity."""
+
+LIVELY = Params(
+    time_step=0.02, deletion_threshold=3500.0, initial_truths=6, birth_rate=0.03, death_probability=0.004
+)
+"""Long steps, so that tracks die within an episode; truths are born and die."""
+
+REWARDS = ("paper", "information", "as_printed")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -32,6 +43,7 @@ class Played:
 
     Attributes:
         initial: the truths at the start.
+        truths: `[K]` the truths after each step.
         noise: `[K]` all that was drawn.
         actions: `[K, 2]` look indices.
         observations: `[K]` observations.
@@ -39,6 +51,7 @@ class Played:
     """
 
     initial: Truths
+    truths: Truths
     noise: StepNoise
     actions: np.ndarray
     observations: dict[str, np.ndarray]
@@ -70,7 +83,7 @@ def _episode(key: jax.Array, params: Params, static: StaticParams, steps: int) -
         noise = env.sample_noise(key_noise)
         after, _ = env.advance(state, action, noise, params)
         terms = reward_terms(state.tracks, after.tracks, after.scan_map, static, params)
-        return after, (noise, action, env.observe(key, after, action, params), sum(terms))
+        return after, (after.truths, noise, action, env.observe(key, after, action, params), sum(terms))
 
     key_reset, key_steps = jax.random.split(key)
     _, state = env.reset_env(key_reset, params)
@@ -101,25 +114,66 @@ def draws_of(played: Played, params: Params) -> Draws:
     )
 
 
+@dataclasses.dataclass
+class EnvironmentTallies:
+    """What is collected over episodes: of observations and rewards, and of the truths."""
+
+    seen: Tally = dataclasses.field(default_factory=Tally)
+    truths: Tally = dataclasses.field(default_factory=Tally)
+
+
+def environment_rows(seeds: Iterable[int], steps: int) -> tuple[list[Row], list[Divergence]]:
+    """Episodes with births and deaths, the three rewards in turn; rows, and what diverged."""
+    tallies, divergences = EnvironmentTallies(), []
+    for seed in seeds:
+        static = dataclasses.replace(STATIC, reward=REWARDS[seed % len(REWARDS)])
+        divergence = compare_environment(static, LIVELY, seed, steps, TOLERANCE, tallies)
+        divergences += [divergence] if divergence else []
+    simulator = "MultiTargetGroundTruthSimulator: transition, birth, death"
+    rows = [
+        tallies.truths.row("truth.propagate_truths", simulator, "truth states"),
+        tallies.seen.row("env.step: observation, reward", "Gymnasium environment of stock parts", "arrays"),
+    ]
+    return rows, divergences
+
+
 def compare_environment(
-    static: StaticParams, params: Params, seed: int, steps: int, tolerance: float, tally: Tally
+    static: StaticParams, params: Params, seed: int, steps: int, tolerance: float, tallies: EnvironmentTallies
 ) -> Divergence | None:
     """Plays Stone Soup's environment on our draws and actions; the first difference, if any.
 
-    Errors are absolute, of scaled observations near [-1, 1] and of rewards.
+    Errors are absolute, of scaled observations near [-1, 1] and of rewards; truths relative to
+    their range.
     """
     played = play_ours(static, params, seed, steps)
     env = StoneSoupEnv(static, params, np.float64, exact_jacobian=True)
     env.reset(options={"draws": draws_of(played, params)})
     for k in range(steps):
         observation, reward, *_ = env.step(played.actions[k])
+        divergence = compare_truths(played, k, env.scenario, tallies.truths)
         ours = {name: values[k] for name, values in played.observations.items()}
         pairs = {name: (ours[name], observation[name]) for name in ours}
         pairs["reward"] = (played.rewards[k], np.asarray(reward))
         for name, (mine, theirs) in pairs.items():
             errors = np.abs(np.asarray(mine, float) - theirs)
-            tally.error(float(errors.max()))
-            if not errors.max() <= tolerance:
+            tallies.seen.error(float(errors.max()))
+            if divergence is None and not errors.max() <= tolerance:
                 worst = tuple(int(i) for i in np.unravel_index(np.argmax(errors), errors.shape))
-                return Divergence(k + 1, None, f"{name}{list(worst)}", mine[worst], theirs[worst])
+                divergence = Divergence(k + 1, None, f"{name}{list(worst)}", mine[worst], theirs[worst])
+        tallies.seen.decision(divergence is None)
+        if divergence is not None:
+            return divergence
+    return None
+
+
+def compare_truths(played: Played, k: int, scenario: StoneSoupScenario, tally: Tally) -> Divergence | None:
+    """The living truths of one step, row by row."""
+    theirs = {scenario.row_of[path]: as_vector(path[-1].state_vector) for path in scenario.paths}
+    alive = {int(row) for row in np.flatnonzero(played.truths.alive[k])}
+    tally.decision(alive == theirs.keys())
+    for row in alive & theirs.keys():
+        gap = np.abs(np.asarray(played.truths.state[k, row]) - theirs[row])
+        tally.error(float(gap.max() / np.linalg.norm(theirs[row][0::2])))
+    if alive != theirs.keys():
+        return Divergence(k + 1, None, "living truths", sorted(alive), sorted(theirs))
     return None

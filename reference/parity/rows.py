@@ -1,6 +1,7 @@
 """One line of the parity table, and the tally that it is made from."""
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 
@@ -72,3 +73,8 @@ class Tally:
     def agreement(self) -> float | None:
         """Share of the decisions that agree; None without any."""
         return self.same / self.decided if self.decided else None
+
+    def row(self, component: str, stone_soup: str, unit: str, **extra: Any) -> Row:
+        """The line that this tally makes in float64."""
+        compared = self.compared or self.decided
+        return Row(component, stone_soup, compared, unit, self.largest, agreement=self.agreement, **extra)

@@ -8,14 +8,15 @@ from gymnasium.utils.env_checker import check_env
 from jaxtrack import Params, StaticParams
 from reference.gym_env import ENV_ID, StoneSoupEnv
 from reference.parity.compare import TOLERANCE
-from reference.parity.environment import STATIC, compare_environment
-from reference.parity.rows import Tally
+from reference.parity.environment import (
+    LIVELY,
+    STATIC,
+    EnvironmentTallies,
+    compare_environment,
+    environment_rows,
+)
 
 SMALL = StaticParams(num_truths=3, max_tracks=6, map_size=12, num_looks=7)
-# Long steps, so that tracks die within the episode; births and deaths of truths.
-LIVELY = Params(
-    time_step=0.02, deletion_threshold=3500.0, initial_truths=6, birth_rate=0.03, death_probability=0.004
-)
 
 
 @pytest.mark.parametrize("continuous", [False, True])
@@ -27,16 +28,19 @@ def test_gymnasiums_own_checker(continuous):
     check_env(env.unwrapped)
 
 
-@pytest.mark.parametrize(
-    ("reward", "params"),
-    [("paper", Params()), ("information", LIVELY), ("as_printed", LIVELY.replace(truth_process_noise=0.0))],
-)
-def test_whole_episodes_equal_ours(reward, params):
-    tally = Tally()
-    static = StaticParams(**{**vars(STATIC), "reward": reward})
-    divergence = compare_environment(static, params, seed=1, steps=150, tolerance=TOLERANCE, tally=tally)
+def test_whole_episodes_equal_ours():
+    """Three rewards in turn, with births and deaths of truths and of tracks."""
+    rows, divergences = environment_rows(range(3), steps=150)
+    assert not divergences, str(divergences[0])
+    assert all(row.passed for row in rows), rows
+    assert rows[1].compared == 3 * 4 * 150
+
+
+def test_an_episode_of_the_papers_scenario_equals_ours():
+    tallies = EnvironmentTallies()
+    divergence = compare_environment(STATIC, Params(), 1, 150, TOLERANCE, tallies)
     assert divergence is None, str(divergence)
-    assert tally.compared == 4 * 150
+    assert tallies.truths.compared == 150 * STATIC.num_truths
 
 
 def play(env, seed, steps=25):
