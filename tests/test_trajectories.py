@@ -264,10 +264,16 @@ def test_the_default_radar_has_the_aircraft_in_front_and_above_the_horizon(state
     recording = read_opensky(states_file(state_rows(4)))
     kept = in_view(recording.states, AIRCRAFT["field_limit"], AIRCRAFT["max_range"])
     np.testing.assert_array_equal(kept, recording.states)
-    # Too small a field for all of them: no other heading of the same place does better.
-    places = np.array([[row[1], row[2], row[3]] for row in FLEET])
-    narrow = place_radar(places, field_limit=0.3, max_range=300e3)
-    assert 1 <= np.isfinite(in_view(to_radar(places, places * 0, narrow), 0.3, 300e3)).all(axis=-1).sum() <= 4
+
+
+def test_the_default_radar_counts_only_what_is_above_its_horizon():
+    """Five low aircraft, of which a radar sees one at most (62 km), and three high ones further off."""
+    low = [[50.0, longitude, 300.0] for longitude in range(5)]
+    places = np.array(low + [[52.0, longitude, 9000.0] for longitude in (0.0, 0.5, 1.0)])
+    radar = place_radar(places, 1.05, 300e3)
+    seen = np.isfinite(in_view(to_radar(places, places * 0, radar), 1.05, 300e3)).all(axis=-1)
+    assert seen[5:].all()
+    assert seen[:5].sum() == 1
 
 
 @pytest.mark.usefixtures("quick_compilation")
