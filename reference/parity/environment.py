@@ -47,7 +47,7 @@ class Played:
         noise: `[K]` all that was drawn.
         actions: `[K, 2]` look indices.
         observations: `[K]` observations.
-        rewards: `[K]` rewards.
+        rewards: `[K]` rewards by name.
     """
 
     initial: Truths
@@ -55,7 +55,7 @@ class Played:
     noise: StepNoise
     actions: np.ndarray
     observations: dict[str, np.ndarray]
-    rewards: np.ndarray
+    rewards: dict[str, np.ndarray]
 
 
 def pointing_or_random(key: jax.Array, state: EnvState, env: SearchTrack, params: Params) -> jax.Array:
@@ -68,7 +68,7 @@ def pointing_or_random(key: jax.Array, state: EnvState, env: SearchTrack, params
 
 
 def play_ours(static: StaticParams, params: Params, seed: int, steps: int) -> Played:
-    """One episode of our environment in float64."""
+    """One episode of our environment in float64, with all rewards, whichever `static` names."""
     with jax.enable_x64(True):
         return Played(*jax.device_get(_episode(jax.random.key(seed), cast(params, True), static, steps)))
 
@@ -76,14 +76,18 @@ def play_ours(static: StaticParams, params: Params, seed: int, steps: int) -> Pl
 @partial(jax.jit, static_argnames=("static", "steps"))
 def _episode(key: jax.Array, params: Params, static: StaticParams, steps: int) -> Any:
     env = SearchTrack(static)
+    by_reward = {name: dataclasses.replace(static, reward=name) for name in REWARDS}
 
     def step(state: EnvState, key: jax.Array) -> tuple[EnvState, Any]:
         key_action, key_noise = jax.random.split(key)
         action = pointing_or_random(key_action, state, env, params)
         noise = env.sample_noise(key_noise)
         after, _ = env.advance(state, action, noise, params)
-        terms = reward_terms(state.tracks, after.tracks, after.scan_map, static, params)
-        return after, (after.truths, noise, action, env.observe(key, after, action, params), sum(terms))
+        rewards = {
+            name: sum(reward_terms(state.tracks, after.tracks, after.scan_map, named, params))
+            for name, named in by_reward.items()
+        }
+        return after, (after.truths, noise, action, env.observe(key, after, action, params), rewards)
 
     key_reset, key_steps = jax.random.split(key)
     _, state = env.reset_env(key_reset, params)
@@ -145,7 +149,7 @@ def compare_environment(
     Errors are absolute, of scaled observations near [-1, 1] and of rewards; truths relative to
     their range.
     """
-    played = play_ours(static, params, seed, steps)
+    played = play_ours(dataclasses.replace(static, reward=REWARDS[0]), params, seed, steps)
     env = StoneSoupEnv(static, params, np.float64, exact_jacobian=True)
     env.reset(options={"draws": draws_of(played, params)})
     for k in range(steps):
@@ -153,7 +157,7 @@ def compare_environment(
         divergence = compare_truths(played, k, env.scenario, tallies.truths)
         ours = {name: values[k] for name, values in played.observations.items()}
         pairs = {name: (ours[name], observation[name]) for name in ours}
-        pairs["reward"] = (played.rewards[k], np.asarray(reward))
+        pairs["reward"] = (played.rewards[static.reward][k], np.asarray(reward))
         for name, (mine, theirs) in pairs.items():
             errors = np.abs(np.asarray(mine, float) - theirs)
             tallies.seen.error(float(errors.max()))

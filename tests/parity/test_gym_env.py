@@ -37,8 +37,8 @@ def test_whole_episodes_equal_ours():
 
 
 def test_an_episode_of_the_papers_scenario_equals_ours():
-    tallies = EnvironmentTallies()
-    divergence = compare_environment(STATIC, Params(), 1, 150, TOLERANCE, tallies)
+    params, tallies = Params(initial_truths=STATIC.num_truths), EnvironmentTallies()
+    divergence = compare_environment(STATIC, params, 1, 150, TOLERANCE, tallies)
     assert divergence is None, str(divergence)
     assert tallies.truths.compared == 150 * STATIC.num_truths
 
