@@ -15,12 +15,12 @@ from rich.console import Console
 from rich.progress import Progress
 
 from benchmarks.playing import Start, compile_play, first, pointing, raster
-from benchmarks.report import circumstances, print_table, spread
 from benchmarks.stone_soup import Look, play_stone_soup, pointing_look, random_look, raster_look
 from jaxtrack import policies
 from jaxtrack.cli import parse, run
 from jaxtrack.env import make
 from jaxtrack.params import Params, StaticParams
+from jaxtrack.report import circumstances, print_table, spread
 from reference.simulation import StoneSoupScenario
 
 

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 from rich.progress import Progress
 
-from benchmarks import environment, playing, report, stone_soup
+from benchmarks import environment, playing, stone_soup
 from benchmarks.environment import EnvironmentOptions
 from jaxtrack import Params, StaticParams, Truths, make, policies
+from jaxtrack.report import PACKAGES
 from reference.simulation import StoneSoupScenario
 from reference.truths import initial_states, truth_simulator
 
@@ -108,7 +109,7 @@ def test_command_writes_all_and_prints_markdown(rows, tmp_path, monkeypatch, cap
     assert environment.main(["--out", str(file), "--markdown", "--num-envs", "1", "3"]) == 0
     result = json.loads(file.read_text())
     assert set(result) == {"date", "versions", "machine", "options", "scenario", "rows"}
-    assert set(result["versions"]) == {"python", *report.PACKAGES}
+    assert set(result["versions"]) == {"python", *PACKAGES}
     assert set(result["machine"]) == {"processor", "cores", "system", "jax_backend"}
     assert result["rows"] == rows
     assert result["options"]["num_envs"] == [1, 3]

@@ -9,6 +9,7 @@ from jaxtrack.params import Params
 from jaxtrack.tracker import TrackerInfo
 from jaxtrack.types import NO_DETECTION, Tracks
 from reference.parity.compare import covariance_error, mean_error
+from reference.parity.rows import Tally
 from reference.pipeline import Estimate, StepRecord
 from reference.translate import TrackKey, slot_keys
 
@@ -48,7 +49,6 @@ class Comparison:
         steps: steps compared; fewer than there are where an exact tie or a divergence ended it.
         error: largest error, in standard deviations of the quantity.
         birth_error: the same over newborn tracks only.
-        decisions: associations, births and deletions that agree.
         updates, births, deletions: how often each happened.
         tie: whether an exact tie ended the comparison.
         divergence: the first difference, None if there is none.
@@ -67,6 +67,31 @@ class Comparison:
     def decisions(self) -> int:
         """Associations, births and deletions that agree."""
         return self.updates + self.births + self.deletions
+
+
+class EpisodeTallies:
+    """What is collected over many episodes against one kind of initiator."""
+
+    def __init__(self) -> None:
+        self.steps, self.decisions, self.ties = 0, 0, 0
+        self.state, self.birth = Tally(), Tally()
+        self.divergences: list[tuple[int, Divergence]] = []
+
+    def add(self, number: int, comparison: Comparison) -> None:
+        """Takes one episode; a divergence counts as one decision that disagrees."""
+        self.steps += comparison.steps
+        self.decisions += comparison.decisions
+        self.ties += comparison.tie
+        self.state.error(comparison.error)
+        self.birth.error(comparison.birth_error)
+        if comparison.divergence is not None:
+            self.divergences.append((number, comparison.divergence))
+
+    @property
+    def agreement(self) -> float:
+        """Share of associations, births and deletions that agree, up to first divergences."""
+        wrong = len(self.divergences)
+        return self.decisions / (self.decisions + wrong) if self.decisions + wrong else float("nan")
 
 
 def compare_episode(

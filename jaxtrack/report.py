@@ -1,10 +1,10 @@
-"""What every benchmark reports beside its figures, and how tables are printed."""
+"""What every command reports beside its figures, and how tables are printed."""
 
 import os
 import platform
 from collections.abc import Sequence
 from datetime import UTC, datetime
-from importlib.metadata import version
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +30,7 @@ def circumstances() -> dict[str, Any]:
     """Date, versions and machine; no names of hosts, users or folders."""
     return {
         "date": datetime.now(UTC).isoformat(timespec="seconds"),
-        "versions": {"python": platform.python_version(), **{name: version(name) for name in PACKAGES}},
+        "versions": {"python": platform.python_version(), **versions()},
         "machine": {
             "processor": processor(),
             "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
@@ -38,6 +38,17 @@ def circumstances() -> dict[str, Any]:
             "jax_backend": jax.default_backend(),
         },
     }
+
+
+def versions() -> dict[str, str]:
+    """Versions of the packages that figures depend on, as far as they are installed."""
+    found = {}
+    for name in PACKAGES:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            continue
+    return found
 
 
 def processor() -> str:
@@ -54,11 +65,15 @@ def print_table(
 ) -> None:
     """Prints a table for the terminal, or in Markdown."""
     if markdown:
-        lines = [header, ["---"] * len(header), *rows]
-        print("\n".join(f"| {' | '.join(line)} |" for line in lines))
+        print(markdown_table(header, rows))
         print(f"\n{title}")
         return
     table = Table(*header, title=title)
     for line in rows:
         table.add_row(*line)
     console.print(table)
+
+
+def markdown_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """The table in Markdown."""
+    return "\n".join(f"| {' | '.join(line)} |" for line in [header, ["---"] * len(header), *rows])

@@ -1,0 +1,162 @@
+"""Measures how equal both sides are: `python -m reference.parity [--quick] [--readme README.md]`."""
+
+import dataclasses
+import json
+import os
+import sys
+import time
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import Any, TypeVar
+
+import jax
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from jaxtrack.cli import parse, run, wide_console
+from jaxtrack.report import circumstances
+from reference.parity.environment import environment_rows
+from reference.parity.free_running import free_running_rows
+from reference.parity.metrics import COMPARISONS, compare
+from reference.parity.models import NUM_MODELS, model_rows
+from reference.parity.oracle import Job, run_all
+from reference.parity.records import random_records
+from reference.parity.rows import Row
+from reference.parity.scenarios import random_scenario
+from reference.parity.stepwise import component_rows
+from reference.parity.table import print_rows, write_readme
+
+Item = TypeVar("Item")
+
+
+@dataclasses.dataclass(frozen=True)
+class ParityOptions:
+    """Compares every component, whole episodes, metrics and the environment with stock Stone Soup.
+
+    Exit code 1 if anything differs by more than it may.
+    """
+
+    quick: bool = False
+    """A small selection, about a minute; the other sizes are then ignored."""
+    episodes: int = 1000
+    """Free-running random episodes."""
+    scenarios: int = 220
+    """Random scenarios that are compared step by step, every intermediate."""
+    steps: int = 50
+    """Steps of each episode and scenario."""
+    samples: int = 2000
+    """Random inputs of each model, measure and sensor."""
+    records: int = 50
+    """Random records on which the metrics are compared."""
+    environments: int = 12
+    """Episodes of the two environments from the same draws, 200 steps each."""
+    seed: int = 0
+    """Number of the first random scenario."""
+    processes: int = 0
+    """Processes for Stone Soup; 0 takes one per core."""
+    out: Path = Path("parity.json")
+    """Results in full."""
+    readme: Path | None = None
+    """Markdown file whose parity table, between its two marks, is replaced."""
+
+
+QUICK: dict[str, Any] = {
+    "episodes": 12,
+    "scenarios": 8,
+    "steps": 40,
+    "samples": 60,
+    "records": 3,
+    "environments": 1,
+}
+
+
+def check(options: ParityOptions) -> None:
+    """Raises ValueError, naming the option, before anything is computed."""
+    for name in QUICK:
+        if getattr(options, name) < 1:
+            raise ValueError(f"{name} = {getattr(options, name)}: expected an integer >= 1")
+    for name in ("seed", "processes"):
+        if getattr(options, name) < 0:
+            raise ValueError(f"{name} = {getattr(options, name)}: expected an integer >= 0")
+    if options.out.is_dir() or not options.out.parent.is_dir():
+        raise ValueError(f"out = {str(options.out)!r}: expected a file in a folder that exists")
+    if options.readme is not None and not options.readme.is_file():
+        raise ValueError(f"readme = {str(options.readme)!r}: no such file")
+
+
+def measure(options: ParityOptions, progress: Progress) -> tuple[list[Row], list[str]]:
+    """All rows of the table, and every first divergence in one line."""
+    processes = options.processes or len(os.sched_getaffinity(0))
+
+    def follow(items: Iterable[Item], total: int, what: str) -> Iterator[Item]:
+        yield from progress.track(items, total=total, description=what)
+
+    first, last = options.seed, options.seed + options.scenarios
+    scenarios = [random_scenario(seed, options.steps) for seed in range(first, last)]
+    jobs = [Job(scenario, intermediates=True) for scenario in scenarios]
+    records = follow(run_all(jobs, processes), len(jobs), "components, step by step")
+    rows = component_rows(zip(scenarios, records, strict=True))
+
+    seeds = range(last, last + options.episodes)
+    episodes, divergences = free_running_rows(seeds, options.steps, processes, follow)
+    rows += episodes
+
+    models = model_rows(options.seed, options.samples)
+    rows += follow(models, NUM_MODELS, "models, measures, sensor")
+    recorded = random_records(options.seed, options.records)
+    compared = (compare(metric, recorded) for metric in COMPARISONS)
+    rows += follow(compared, len(COMPARISONS), "metrics")
+    seeds = range(options.environments)
+    environments, differing = environment_rows(follow(seeds, len(seeds), "environments"), steps=200)
+    divergences += [f"environment: {divergence}" for divergence in differing]
+    return rows + environments, divergences
+
+
+def main(argv: Sequence[str]) -> int:
+    """The command."""
+    options = parse(ParityOptions(), argv, "python -m reference.parity")
+    if options.quick:
+        options = dataclasses.replace(options, **QUICK)
+    check(options)
+    jax.config.update("jax_enable_x64", True)
+    started = time.perf_counter()
+    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
+    with Progress(*columns, console=Console(stderr=True), disable=not sys.stderr.isatty()) as progress:
+        rows, divergences = measure(options, progress)
+    seconds = time.perf_counter() - started
+
+    print_rows(rows, wide_console())
+    for line in divergences:
+        print(line)
+    failed = [row for row in rows if not row.passed]
+    for row in failed:
+        print(f"FAILED: {row.component} against {row.stone_soup}: {row.float64}, {row.agreement}")
+    options.out.write_text(json.dumps(result(options, rows, divergences, seconds), indent=1) + "\n")
+    if options.readme is not None:
+        write_readme(options.readme, rows, options_line(options, seconds))
+    print(f"{options.out}: {len(rows)} rows, {len(failed)} failed, {seconds:.0f} s")
+    return 1 if failed else 0
+
+
+def result(options: ParityOptions, rows: list[Row], divergences: list[str], seconds: float) -> dict:
+    """What is written."""
+    asked = {name: value for name, value in vars(options).items() if name not in ("out", "readme")}
+    return {
+        **circumstances(),
+        "options": asked,
+        "seconds": round(seconds, 1),
+        "rows": [dataclasses.asdict(row) | {"passed": row.passed} for row in rows],
+        "divergences": divergences,
+    }
+
+
+def options_line(options: ParityOptions, seconds: float) -> str:
+    """What was run, for beneath the table."""
+    found = circumstances()
+    versions = ", ".join(f"{name} {found['versions'][name]}" for name in ("python", "jax", "stonesoup"))
+    size = f"{options.scenarios * options.steps:,} steps one by one, {options.episodes:,} whole episodes"
+    return f"{size}; {versions}; {found['machine']['cores']} cores, {seconds / 60:.0f} min."
+
+
+if __name__ == "__main__":
+    run(main)
