@@ -14,7 +14,6 @@ from jaxtrack.models import wrap_detection
 from jaxtrack.params import Params
 from jaxtrack.types import DETECTION_DIM, NO_DETECTION, Detections, Tracks
 
-
 Measure = Callable[[ExpectedDetections, Detections, Params], jax.Array]
 """Distances `[T, D]` of every detection from every track's expectation."""
 
