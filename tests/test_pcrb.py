@@ -80,11 +80,11 @@ def test_a_record_is_bounded_truth_by_truth():
     states[~alive] = np.nan
     times = np.array([0.0, 0.1, 0.2], np.float32)
     result = bounds(Truths(jnp.asarray(states), jnp.asarray(alive)), times, PARAMS)
-    for row, detection in enumerate(([0.0, 0.0, 0.0], [0.0, 0.0, 0.0])):
+    for row in range(2):
         first = int(alive[:, row].argmax())
         x, y, z = states[first, row, 0::2]
         detection = [np.arctan2(z, np.hypot(x, y)), np.arctan2(y, x), np.sqrt(x**2 + y**2 + z**2)]
-        prior = initial_estimate(jnp.array(detection), PARAMS)[1]
+        prior = jax.jit(initial_estimate)(jnp.array(detection), PARAMS)[1]
         np.testing.assert_allclose(result.covariance[first, row], prior, rtol=1e-4, atol=1e-3)
         alone = path_bound(states[:, row], alive[:, row], times, prior, PARAMS)
         np.testing.assert_allclose(result.position[:, row], alone.position, rtol=1e-5)
@@ -99,3 +99,15 @@ def test_a_given_prior_is_used():
     prior = jnp.diag(jnp.array([100.0, 0.0] * 3))[None]
     result = bounds(truths, jnp.array([0.0, 0.1]), PARAMS, prior, 1.0)
     np.testing.assert_allclose(result.position[:, 0], bound_of([0.0, 0.1]).position, rtol=1e-6)
+
+
+def test_rounding_does_not_grow_over_a_long_path():
+    steps = 400
+    states = np.tile(np.array([700.0, -30, 430, -6, 940, -5]), (steps, 1))
+    times = 0.005 * np.arange(steps)
+    states[:, 0::2] += times[:, None] * states[:, 1::2]
+    truths = Truths(states.astype(np.float32)[:, None], np.ones((steps, 1), dtype=bool))
+    params = PARAMS.replace(process_noise=1.0)
+    covariance = np.asarray(bounds(truths, times.astype(np.float32), params).covariance[-1, 0])
+    sigma = np.sqrt(np.diagonal(covariance))
+    np.testing.assert_allclose((covariance - covariance.T) / np.outer(sigma, sigma), 0.0, atol=1e-5)

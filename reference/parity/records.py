@@ -43,7 +43,7 @@ def random_record(
 
     Truths appear and vanish, one may never live, and several lie within reach of each other.
     Tracks begin and end, one after another in a slot, follow a truth, pass to another one, miss
-    a step, or belong to none. Empty rows hold NaN.
+    a step, or belong to none; on two steps there is no track at all. Empty rows hold NaN.
     """
     path = _random_paths(rng, params, num_steps, num_truths)
     alive = _random_lives(rng, num_steps, num_truths)
@@ -93,13 +93,15 @@ def _random_tracks(
     """Birth step `[K, T]` of the track in every slot, `NEVER` where there is none, and what it is near."""
     births = np.full((num_steps, max_tracks), NEVER)
     target = np.full((num_steps, max_tracks), NO_TRUTH)
+    pause = int(rng.integers(num_steps // 2, num_steps))  # for two steps nobody tracks anything
     for slot in range(max_tracks):
-        birth = int(rng.integers(0, 10))
-        while birth < num_steps:
-            life = min(int(rng.integers(1, num_steps)), num_steps - birth)
-            births[birth : birth + life, slot] = birth
-            target[birth : birth + life, slot] = _random_targets(rng, life, num_truths)
-            birth += life + int(rng.integers(0, 6))  # 0: deleted and replaced in one step
+        for first, end in ((0, pause), (pause + 2, num_steps)):
+            birth = first + int(rng.integers(0, 8))
+            while birth < end:
+                life = min(int(rng.integers(1, num_steps)), end - birth)
+                births[birth : birth + life, slot] = birth
+                target[birth : birth + life, slot] = _random_targets(rng, life, num_truths)
+                birth += life + int(rng.integers(0, 6))  # 0: deleted and replaced in one step
     return births, target
 
 
@@ -114,3 +116,18 @@ def _random_targets(rng: np.random.Generator, life: int, num_truths: int) -> np.
     glitch = rng.random(life) < GLITCH
     # A track that errs tends to err towards the same rival.
     return np.where(glitch, rival[turns], lasting[turns])
+
+
+def random_records(seed: int, count: int) -> list[Record]:
+    """Records of one shape, so that everything is compiled once, with random numbers of the metrics."""
+    records = []
+    for rng in np.random.default_rng(seed).spawn(count):
+        reach = rng.uniform(50, 400)
+        params = Params(
+            time_step=int(rng.integers(5, 500)) / 1000,
+            gospa_cutoff=reach,
+            gospa_order=float(rng.choice([1.0, 2.0, 3.0])),
+            siap_threshold=rng.uniform(50, 400),
+        )
+        records.append(random_record(rng, params))
+    return records
