@@ -5,6 +5,7 @@
 As a function: `jaxtrack.tracking.track_scans`.
 """
 
+import contextlib
 import dataclasses
 import math
 import sys
@@ -112,9 +113,13 @@ def track_file(recorded: RecordedDetections, params: Params, options: Options) -
     started, scans, tracks, compiling = time.perf_counter(), 0, 0, 0.0
     paths = TrackPaths(recorded) if options.plot else None
     try:
-        with TrackWriter(options.out, recorded.label) as writer, _progress() as progress:
+        with (
+            TrackWriter(options.out, recorded.label) as writer,
+            _progress() as progress,
+            contextlib.closing(track_scans(recorded, params)) as chunks,
+        ):
             task = progress.add_task("tracking", total=len(recorded.time), speed="")
-            for rows in track_scans(recorded, params):
+            for rows in chunks:
                 writer.write(rows)
                 if paths:
                     paths.add(rows)

@@ -9,7 +9,7 @@ No track and no detection is ever left out: capacities follow what is recorded.
 
 import dataclasses
 import time
-from collections.abc import Iterator
+from collections.abc import Generator
 
 import jax
 import jax.numpy as jnp
@@ -28,7 +28,7 @@ SMALLEST = 8
 CHUNK_BYTES = 64 * 10**6
 """Estimates kept of one call; where tracks are many, a call has fewer scans."""
 PAIR_ARRAYS = 6
-"""Arrays of one number for each pair of track and detection that a step needs at once (measured)."""
+"""Numbers for each pair of track and detection that a step needs at once (measured)."""
 MEMORY_LIMIT = 4 * 10**9
 """A scan whose pairs of tracks and detections need more is refused (bytes)."""
 NO_TRACK = -1
@@ -94,7 +94,9 @@ class Scans(struct.PyTreeNode):
     index: jax.Array
 
 
-def track_scans(recorded: RecordedDetections, params: Params, chunk: int = CHUNK) -> Iterator[TrackRows]:
+def track_scans(
+    recorded: RecordedDetections, params: Params, chunk: int = CHUNK
+) -> Generator[TrackRows, None, None]:
     """Runs the tracker over recorded detections; computes ahead of what was taken.
 
     In float64 (`jax_enable_x64`) the rows are Stone Soup's `MultiTargetTracker`'s to 1e-9
@@ -109,32 +111,36 @@ def track_scans(recorded: RecordedDetections, params: Params, chunk: int = CHUNK
         Live tracks of the next scans, until all S are done.
 
     Raises:
-        ValueError: if a scan has so many detections that its pairs with tracks need more
-            than `MEMORY_LIMIT` bytes.
+        ValueError: if the pairs of detections and tracks of a scan need more than `MEMORY_LIMIT`.
     """
     state, done, rows, compile_seconds = _empty(SMALLEST), 0, None, 0.0
-    while done < len(recorded.time):
-        batch = _batch(recorded, done, chunk, state)
-        state = _resized(state, max(_slots(state), batch.active.shape[1]))
-        _check_memory(recorded, batch, state)
-        began = time.perf_counter()
-        _run.lower(state, batch, params).compile()
-        compile_seconds += time.perf_counter() - began
-        after, made = _run(state, batch, params)
+    after = state
+    try:
+        while done < len(recorded.time):
+            batch = _batch(recorded, done, chunk, state)
+            state = _resized(state, max(_slots(state), batch.active.shape[1]))
+            _check_memory(recorded, batch, state)
+            began = time.perf_counter()
+            _run.lower(state, batch, params).compile()
+            compile_seconds += time.perf_counter() - began
+            after, made = _run(state, batch, params)
+            if rows is not None:
+                yield rows
+                rows = None
+            shortage = np.asarray(made.num_dropped)
+            if shortage.any():
+                # Again from the same state, as if the slots had been there from the start.
+                state = _resized(state, _slots(state) + shortage[shortage > 0][0])
+                continue
+            stop = min(done + len(batch.index), len(recorded.time))
+            rows = _rows(made, range(done, stop), int(after.born), compile_seconds)
+            _check_finite(rows, recorded)
+            state, done = _resized(after, np.asarray(made.active).sum(axis=1).max()), stop
         if rows is not None:
             yield rows
-            rows = None
-        shortage = np.asarray(made.num_dropped)
-        if shortage.any():
-            # Again from the same state, as if the slots had been there from the start.
-            state = _resized(state, _slots(state) + shortage[shortage > 0][0])
-            continue
-        stop = min(done + len(batch.index), len(recorded.time))
-        rows = _rows(made, range(done, stop), int(after.born), compile_seconds)
-        _check_finite(rows, recorded)
-        state, done = _resized(after, np.asarray(made.active).sum(axis=1).max()), stop
-    if rows is not None:
-        yield rows
+    finally:
+        # What still computes when Python ends, after Ctrl-C, crashes it.
+        jax.block_until_ready(after)
 
 
 class Made(struct.PyTreeNode):

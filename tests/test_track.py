@@ -52,7 +52,7 @@ def chunks(recorded):
 @pytest.fixture
 def one_call(monkeypatch, chunks):
     """Lets the command take the rows that were computed already."""
-    monkeypatch.setattr(track, "track_scans", lambda *_: iter(chunks))
+    monkeypatch.setattr(track, "track_scans", lambda *_: (rows for rows in chunks))
 
 
 def test_the_file_holds_every_row_exactly(recorded, chunks, tmp_path, capsys):
