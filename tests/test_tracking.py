@@ -95,6 +95,16 @@ def test_tracks_are_numbered_by_birth_and_know_their_detection(large):
     assert np.all(in_empty_scans == NO_DETECTION)
 
 
+def test_rows_stay_in_order_of_birth_when_a_new_track_takes_an_old_slot():
+    gone, stays, comes = ([0.1, bearing, 3000.0] for bearing in (0.0, 1.0, 2.0))
+    scans = [[gone, stays], [stays], [stays], [comes, stays], [comes, stays], [comes, stays], [stays]]
+    recorded = RecordedDetections.from_scans(0.5 * np.arange(7), [np.array(scan) for scan in scans])
+    rows = table(track_scans(recorded, PARAMS, chunk=3))
+    assert rows["scan"].tolist() == [0, 0, 1, 1, 2, 3, 3, 4, 4, 5, 5, 6, 6]
+    assert rows["track"].tolist() == [0, 1, 0, 1, 1, 1, 2, 1, 2, 1, 2, 1, 2]
+    assert rows["detection"].tolist() == [0, 1, -1, 0, 0, 1, 0, 1, 0, 1, 0, 0, -1]
+
+
 def test_exact_ties_do_not_depend_on_capacity(monkeypatch):
     """Detections written twice make twins; the next detection is as near to both, the older gets it."""
     rng = np.random.default_rng(1)
