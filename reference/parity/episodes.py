@@ -98,6 +98,7 @@ def compare_episode(
     records: list[StepRecord],
     tracks: Tracks,
     info: TrackerInfo,
+    active: np.ndarray,
     params: Params,
     tolerance: float,
 ) -> Comparison:
@@ -107,6 +108,7 @@ def compare_episode(
         records: Stone Soup's steps.
         tracks: `[K, T]` our track lists after every step.
         info: `[K]` our intermediates.
+        active: `[K, D]` which rows of the scans hold a detection.
         params: numbers of the tracker.
         tolerance: largest error, in standard deviations, that is no divergence.
     """
@@ -114,7 +116,7 @@ def compare_episode(
     before: list[TrackKey | None] = [None] * tracks.active.shape[1]
     for k, record in enumerate(records):
         now, made = (jax.tree.map(lambda leaf, k=k: leaf[k], tree) for tree in (tracks, info))
-        if is_tied(made, params):
+        if is_tied(made, active[k], params):
             result.tie = True
             return result
         after = slot_keys(now)
@@ -128,11 +130,11 @@ def compare_episode(
     return result
 
 
-def is_tied(info: TrackerInfo, params: Params) -> bool:
+def is_tied(info: TrackerInfo, active: np.ndarray, params: Params) -> bool:
     """Whether two admissible pairs compete for a track or a detection at the same distance."""
     limit = min(float(params.gate_threshold), float(params.missed_distance))
     distances = np.asarray(info.distances, dtype=float)
-    exists = np.asarray(info.predicted.active)[:, None]
+    exists = np.asarray(info.predicted.active)[:, None] & active
     admissible = np.where(exists & (distances < limit * (1 + TIE)), distances, np.inf)
     return _repeats(admissible) or _repeats(admissible.T)
 

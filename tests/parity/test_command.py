@@ -1,0 +1,225 @@
+"""`python -m reference.parity`: its table, its verdict, and what it says of a first difference."""
+
+import dataclasses
+import json
+
+import jax
+import numpy as np
+import pytest
+
+from reference.parity import __main__ as command
+from reference.parity import oracle, ours
+from reference.parity.compare import TOLERANCE, exact_mahalanobis
+from reference.parity.episodes import EpisodeTallies, compare_episode
+from reference.parity.rows import Row, Tally
+from reference.parity.scenarios import KINDS, random_scenario
+from reference.parity.table import BEGIN, END, cells, write_readme
+
+pytestmark = pytest.mark.usefixtures("quick_compilation")
+
+STEPS = 40
+TABLE_FROM_THE_PAPER = [
+    "KalmanPredictor",
+    "UnscentedKalmanUpdater",
+    "DistanceHypothesiser",
+    "DistanceGater",
+    "NearestNeighbour",
+    "SimpleMeasurementInitiator",
+    "CovarianceBasedDeleter",
+    "MultiTargetTracker",
+    "Mahalanobis",
+    "Euclidean",
+    "KLDivergence",
+    "GaussianHellinger",
+    "SumofCovarianceNorms",
+    "GOSPAMetric",
+    "SIAPMetrics",
+    "BasicMetrics",
+    "PCRBMetric",
+    "MultiTargetGroundTruthSimulator",
+    "FixedPlatform",
+    "RadarRotatingElevationBearingRange",
+    "Gymnasium",
+]
+
+
+def test_the_quick_run(tmp_path, capsys):
+    """Everything that the full run does, in small."""
+    readme = tmp_path / "README.md"
+    readme.write_text(f"before\n{BEGIN}\nstale table\n{END}\nafter\n")
+    out = tmp_path / "parity.json"
+    code = command.main(["--quick", "--processes", "1", "--out", str(out), "--readme", str(readme)])
+    found = json.loads(out.read_text())
+    assert code == 0, capsys.readouterr().out
+    assert found["divergences"] == []
+    assert all(row["passed"] for row in found["rows"])
+    table = readme.read_text()
+    assert table.startswith("before\n")
+    assert table.endswith("after\n")
+    assert "stale" not in table
+    for name in TABLE_FROM_THE_PAPER:
+        assert any(name in row["stone_soup"] for row in found["rows"]), name
+        assert name in table
+    assert found["options"]["episodes"] == command.QUICK["episodes"]
+    assert found["versions"]["stonesoup"] == "1.9.1"
+
+
+@pytest.mark.parametrize("arguments", [["--episodes", "0"], ["--seed", "-1"], ["--out", "/no/such/folder/x"]])
+def test_wrong_options_are_named_before_anything_is_computed(arguments):
+    with pytest.raises(ValueError, match=f"{arguments[0].removeprefix('--')} = "):
+        command.main(arguments)
+
+
+def test_random_scenarios_hold_what_they_promise():
+    """Wraps, births and deaths of truths, clutter, misses and empty scans, among few of them."""
+    scenarios = [random_scenario(seed, STEPS) for seed in range(15)]
+    assert {scenario.kind for scenario in scenarios} == set(KINDS)
+    bearings = np.concatenate([s.detections.value[..., 1][s.detections.active] for s in scenarios])
+    elevations = np.concatenate([s.detections.value[..., 0][s.detections.active] for s in scenarios])
+    assert bearings.max() > 3.1
+    assert bearings.min() < -3.1
+    assert np.abs(elevations).max() > 1.5
+    assert len({s.truths.alive.shape[1] for s in scenarios}) > 3
+    assert any((s.detections.truth[s.detections.active] < 0).any() for s in scenarios)
+    assert any(not s.truths.alive.all() for s in scenarios)
+    assert all((~s.detections.active).all(axis=1).any() for s in scenarios)
+
+
+@pytest.fixture(scope="module")
+def played():
+    """One scenario on both sides."""
+    scenario = random_scenario(15, STEPS)
+    return scenario, oracle.run(oracle.Job(scenario)), *ours.episode(scenario)
+
+
+def test_equal_episodes_have_no_divergence(played):
+    scenario, records, tracks, info = played
+    found = compare_episode(records, tracks, info, scenario.detections.active, scenario.params, TOLERANCE)
+    assert found.divergence is None
+    assert found.steps == STEPS
+    assert min(found.updates, found.births, found.deletions) > 5
+
+
+def changed(records, step, **fields):
+    return [*records[:step], dataclasses.replace(records[step], **fields), *records[step + 1 :]]
+
+
+def first(records, kind):
+    """First step on which something of a kind happened, and to which track."""
+    return next((k, sorted(getattr(r, kind))[0]) for k, r in enumerate(records) if getattr(r, kind))
+
+
+@pytest.mark.parametrize(
+    ("kind", "quantity"),
+    [("associated", "associated detection"), ("deleted", "deleted"), ("initiated", "initiated")],
+)
+def test_a_different_decision_is_named(played, kind, quantity):
+    scenario, records, tracks, info = played
+    step, key = first(records, kind)
+    without = (
+        {k: v for k, v in getattr(records[step], kind).items() if k != key}
+        if kind == "associated"
+        else (getattr(records[step], kind) - {key})
+    )
+    found = compare_episode(
+        changed(records, step, **{kind: without}),
+        tracks,
+        info,
+        scenario.detections.active,
+        scenario.params,
+        1e-9,
+    )
+    divergence = found.divergence
+    assert (divergence.step, divergence.track, divergence.quantity) == (step + 1, key, quantity)
+    assert divergence.ours != divergence.theirs
+    assert f"step {step + 1}, track born on step {key[0]} from {key[1]}: {quantity}" in str(divergence)
+
+
+@pytest.mark.parametrize("quantity", ["mean", "covariance"])
+def test_a_different_estimate_is_named_with_both_values(played, quantity):
+    scenario, records, tracks, info = played
+    step, key = first(records, "live")
+    estimate = records[step].live[key]
+    off = dataclasses.replace(estimate, **{quantity: getattr(estimate, quantity) * (1 + 1e-6)})
+    records = changed(records, step, live={**records[step].live, key: off})
+    divergence = compare_episode(
+        records, tracks, info, scenario.detections.active, scenario.params, TOLERANCE
+    ).divergence
+    assert (divergence.step, divergence.track) == (step + 1, key)
+    assert divergence.quantity.startswith(quantity)
+    assert np.any(divergence.ours != divergence.theirs)
+
+
+def test_exact_ties_end_a_comparison_and_are_counted(played):
+    """Every detection twice: two tracks are born in one place, and compete for what follows."""
+    scenario, *_ = played
+    detections = jax.tree.map(
+        lambda leaf: np.concatenate([leaf[:, :8], leaf[:, :8]], axis=1), scenario.detections
+    )
+    twice = dataclasses.replace(scenario, detections=detections)
+    records = oracle.run(oracle.Job(twice))
+    found = compare_episode(records, *ours.episode(twice), twice.detections.active, twice.params, TOLERANCE)
+    assert found.tie
+    assert found.divergence is None
+    assert found.steps < STEPS
+    tallies = EpisodeTallies()
+    tallies.add(0, found)
+    assert tallies.ties == 1
+
+
+def test_oracles_in_processes_give_the_same(played):
+    scenario, records, *_ = played
+    short = dataclasses.replace(scenario, detections=jax.tree.map(lambda leaf: leaf[:5], scenario.detections))
+    (found,) = oracle.run_all([oracle.Job(short)], processes=2)
+    for mine, theirs in zip(found, records[:5], strict=True):
+        assert mine.live.keys() == theirs.live.keys()
+        assert mine.associated == theirs.associated
+
+
+def test_exact_distances_are_those_of_the_formula():
+    S = np.array([[2e-6, 1e-6, 1e-4], [1e-6, 3e-6, -2e-4], [1e-4, -2e-4, 5.0]])
+    mean, value = np.array([1.5, 3.1, 1000.0]), np.array([[1.5 + 1e-3, -3.1, 1001.0]])
+    d = np.array([-1e-3, 6.2 - 2 * np.pi, -1.0])
+    np.testing.assert_allclose(
+        exact_mahalanobis(mean, S, value), np.sqrt(d @ np.linalg.solve(S, d)), rtol=1e-9
+    )
+
+
+GOOD = Row("a", "b", 10, "steps", 1e-12, agreement=1.0)
+
+
+@pytest.mark.parametrize(
+    ("fields", "passed"),
+    [
+        ({}, True),
+        ({"float64": 2e-9}, False),
+        ({"float64": float("nan")}, False),
+        ({"agreement": 0.9999}, False),
+        ({"compared": 0}, False),
+        ({"float64": None}, True),
+        ({"float64": 2e-9, "tolerance": 1e-6}, True),
+    ],
+)
+def test_a_row_passes_only_if_all_of_it_does(fields, passed):
+    assert dataclasses.replace(GOOD, **fields).passed is passed
+
+
+def test_nearly_all_is_not_printed_as_all():
+    assert cells(dataclasses.replace(GOOD, agreement=1 - 1e-9))[-1] == "99.9999 %"
+    assert cells(GOOD)[-1] == "100 %"
+
+
+def test_a_tally_keeps_nan():
+    tally = Tally()
+    for error in (1.0, float("nan"), 2.0):
+        tally.error(error)
+    assert np.isnan(tally.largest)
+    assert not tally.row("a", "b", "steps").passed
+
+
+def test_a_readme_without_marks_is_refused(tmp_path):
+    path = tmp_path / "README.md"
+    path.write_text("nothing")
+    with pytest.raises(ValueError, match="expected the marks"):
+        write_readme(path, [GOOD], "below")
+    assert path.read_text() == "nothing"
