@@ -14,10 +14,10 @@ from typing import Any
 import jax
 import numpy as np
 
-from benchmarks.report import circumstances, print_table
 from jaxtrack.cli import parse, run, wide_console
 from jaxtrack.detection_file import COLUMNS, RecordedDetections, read_detections
 from jaxtrack.params import Params
+from jaxtrack.report import circumstances, print_table
 from jaxtrack.track import Options, track_file
 from jaxtrack.tracking import TrackRows, track_scans
 from reference.parity.compare import TOLERANCE, covariance_error, mean_error
