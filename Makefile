@@ -7,12 +7,14 @@ ARGS ?=
 
 export JAX_PLATFORMS ?= cpu
 
-.PHONY: help setup train test slow lint bench clean
+.PHONY: help setup train test slow sb3 parity lint bench clean
 
 help:
 	@echo "make train   train an agent, compare it with the baselines, draw pictures (runs/)"
 	@echo "make test    lint, types and all quick tests"
 	@echo "make slow    the tests that take longer"
+	@echo "make sb3     the tests that need Stable-Baselines3, which it installs (with torch, 1 GB)"
+	@echo "make parity  the parity table of the README, in full"
 	@echo "make lint    ruff and mypy only"
 	@echo "make bench   throughput of our environment beside Stone Soup's"
 	@echo "make setup   .venv with everything the above need"
@@ -36,6 +38,13 @@ test: setup
 
 slow: setup
 	$(BIN)/pytest -m slow $(ARGS)
+
+sb3: setup
+	$(BIN)/pip install --quiet --editable ".[sb3]"
+	$(BIN)/pytest -m sb3 $(ARGS)
+
+parity: setup
+	$(BIN)/python -m reference.parity --out docs/parity.json --readme README.md $(ARGS)
 
 lint: setup
 	$(BIN)/ruff check .

@@ -113,18 +113,21 @@ def associate_nearest_neighbour(admissible: jax.Array) -> jax.Array:
         `[T]` index of each track's detection, or `NO_DETECTION`.
     """
     num_tracks, num_detections = admissible.shape
+    tracks, rows = jnp.arange(num_tracks), jnp.arange(num_detections)
 
     def any_left(carry: tuple[jax.Array, jax.Array]) -> jax.Array:
         return jnp.any(jnp.isfinite(carry[0]))
 
     def take_nearest(carry: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        # Two that are each other's nearest are taken before any pair that competes with them,
+        # so all such pairs can be taken at once.
         left, associated = carry
-        nearest = jnp.argmin(left)
-        is_track = jnp.arange(num_tracks) == nearest // num_detections
-        is_detection = jnp.arange(num_detections) == nearest % num_detections
-        associated = jnp.where(is_track, nearest % num_detections, associated)
-        removed = is_track[:, None] | is_detection[None]
-        return jnp.where(removed, jnp.inf, left), associated
+        nearest_detection, nearest_track = jnp.argmin(left, axis=1), jnp.argmin(left, axis=0)
+        mutual = nearest_track[nearest_detection] == tracks
+        taken = mutual & jnp.isfinite(left.min(axis=1))
+        associated = jnp.where(taken, nearest_detection, associated)
+        used = jnp.any((associated[:, None] == rows) & taken[:, None], axis=0)
+        return jnp.where(taken[:, None] | used, jnp.inf, left), associated
 
     nothing = jnp.full(num_tracks, NO_DETECTION)
     # Which pairs are chosen has no gradient; the update that follows does.

@@ -21,6 +21,9 @@ from jaxtrack.types import Detections, Tracks, Truths
 
 ENV_ID = "SearchTrack-v0"
 
+ALWAYS_IN_INFO = ("completeness", "covariance_norm_sum", "covariance_norm_mean")
+"""Metrics that are cheap enough for every step."""
+
 
 @struct.dataclass
 class EnvState(environment.EnvState):
@@ -121,11 +124,11 @@ class SearchTrack(environment.Environment[EnvState, Params]):
     def step_env(
         self, key: jax.Array, state: EnvState, action: jax.Array, params: Params
     ) -> tuple[Observation, EnvState, jax.Array, jax.Array, dict[str, jax.Array]]:
-        """One step: observation, state, reward, terminated (never), info."""
+        """One step: observation, state, reward, terminated, info."""
         before = state
         state, record = self.advance(state, action, self.sample_noise(key), params)
-        terms = reward_terms(before.tracks, state.tracks, state.scan_map, self.static, params)
-        info = step_info(state, record, terms, params)
+        terms = reward_terms(before.tracks, state.tracks, state.truths, state.scan_map, self.static, params)
+        info = step_info(state, record, terms, self.static, params)
         observation = self.observe(key, state, action, params)
         return observation, state, terms[0] + terms[1], self.is_terminated(state, params), info
 
@@ -160,9 +163,11 @@ class SearchTrack(environment.Environment[EnvState, Params]):
         return observe(state.tracks, state.scan_map, params)
 
     def is_terminated(self, state: EnvState, params: Params) -> jax.Array:
-        """Never: episodes end by truncation only."""
-        del state, params
-        return jnp.asarray(False)
+        """Whether the stop metric exceeds its threshold; without one, never."""
+        if self.static.stop_metric is None or params.stop_threshold is None:
+            return jnp.asarray(False)
+        value = metrics.METRICS[self.static.stop_metric](state.truths, state.tracks, params)
+        return value > params.stop_threshold
 
     def action_space(self, params: Params) -> spaces.Box | spaces.Indices:
         """Two integers in [0, num_looks), or two angles in rad."""
@@ -184,14 +189,17 @@ class SearchTrack(environment.Environment[EnvState, Params]):
 
 
 def step_info(
-    state: EnvState, record: StepRecord, terms: tuple[jax.Array, jax.Array], params: Params
+    state: EnvState,
+    record: StepRecord,
+    terms: tuple[jax.Array, jax.Array],
+    static: StaticParams,
+    params: Params,
 ) -> dict[str, jax.Array]:
     """What a user wants to log of one step; every entry is a scalar."""
+    asked = {name: metrics.METRICS[name] for name in (*ALWAYS_IN_INFO, *static.info_metrics)}
     return {
+        **{name: metric(state.truths, state.tracks, params) for name, metric in asked.items()},
         "live_tracks": jnp.sum(state.tracks.active),
-        "completeness": metrics.completeness(state.truths, state.tracks, params),
-        "covariance_norm_sum": metrics.covariance_norm_sum(state.tracks),
-        "covariance_norm_mean": metrics.covariance_norm_mean(state.tracks),
         "mean_scan_value": jnp.mean(state.scan_map),
         "reward_track": terms[0],
         "reward_search": terms[1],

@@ -1,5 +1,7 @@
 """How good a track list is, given the truths: for evaluation, never for the agent."""
 
+from collections.abc import Callable
+
 import jax
 import jax.numpy as jnp
 import optax
@@ -216,3 +218,18 @@ def covariance_norm_sum(tracks: Tracks) -> jax.Array:
 def covariance_norm_mean(tracks: Tracks) -> jax.Array:
     """Mean over live tracks of the covariance norm; 0 without tracks."""
     return covariance_norm_sum(tracks) / jnp.maximum(jnp.sum(tracks.active), 1)
+
+
+StepMetric = Callable[[Truths, Tracks, Params], jax.Array]
+
+METRICS: dict[str, StepMetric] = {
+    "gospa": lambda truths, tracks, params: gospa(truths, tracks, params).distance,
+    "gospa_localisation": lambda truths, tracks, params: gospa(truths, tracks, params).localisation,
+    "gospa_missed": lambda truths, tracks, params: gospa(truths, tracks, params).missed,
+    "gospa_false": lambda truths, tracks, params: gospa(truths, tracks, params).false,
+    "completeness": completeness,
+    "uncertainty_per_truth": uncertainty_per_truth,
+    "covariance_norm_sum": lambda truths, tracks, params: covariance_norm_sum(tracks),
+    "covariance_norm_mean": lambda truths, tracks, params: covariance_norm_mean(tracks),
+}
+"""Metrics of one step by name: for `info`, as a stop criterion, and for one's own reward."""

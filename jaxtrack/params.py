@@ -13,7 +13,17 @@ import jax
 import numpy as np
 from flax import struct
 
-REWARDS = ("paper", "as_printed", "information")
+REWARDS = ("paper", "as_printed", "information", "gospa")
+METRICS = (
+    "gospa",
+    "gospa_localisation",
+    "gospa_missed",
+    "gospa_false",
+    "completeness",
+    "uncertainty_per_truth",
+    "covariance_norm_sum",
+    "covariance_norm_mean",
+)
 MEASURES = (
     "mahalanobis",
     "squared_mahalanobis",
@@ -53,7 +63,11 @@ class StaticParams:
     continuous_actions: bool = False
     """Actions are (azimuth, elevation) in radians instead of two look indices."""
     reward: str = "paper"
-    """Reward by name: paper, as_printed or information."""
+    """Reward by name: paper, as_printed, information or gospa (which reads the truths)."""
+    info_metrics: tuple[str, ...] = ()
+    """More metrics of every step for `info`, by name; `jaxtrack.metrics.METRICS` lists them."""
+    stop_metric: str | None = None
+    """Metric that ends an episode as soon as it exceeds `stop_threshold`; unset, none does."""
     measure: str = "mahalanobis"
     """Distance of a detection from a track: mahalanobis, squared_mahalanobis, euclidean,
     kullback_leibler, hellinger or squared_hellinger; the gate has its unit."""
@@ -67,9 +81,12 @@ class StaticParams:
                 isinstance(value, bool) or not isinstance(value, int) or value < low.get(field.name, 1)
             ):
                 raise ValueError(f"{field.name} = {value!r}: expected an integer >= {low.get(field.name, 1)}")
-        for name, known in (("reward", REWARDS), ("measure", MEASURES)):
-            if getattr(self, name) not in known:
-                raise ValueError(f"{name} = {getattr(self, name)!r}: expected one of {', '.join(known)}")
+        choices = [("reward", self.reward, REWARDS), ("measure", self.measure, MEASURES)]
+        choices += [("info_metrics", name, METRICS) for name in self.info_metrics]
+        choices += [("stop_metric", self.stop_metric, METRICS)] if self.stop_metric is not None else []
+        for field_name, chosen, known in choices:
+            if chosen not in known:
+                raise ValueError(f"{field_name} = {chosen!r}: expected one of {', '.join(known)}")
 
 
 def _quantity(default: float, unit: str, low: float, high: float = math.inf, open_low: bool = False) -> Any:
@@ -147,6 +164,8 @@ class Params:
     """Weight of the reward's track term."""
     search_weight: float = _quantity(0.5, "1", 0.0)
     """Weight of the reward's search term."""
+    stop_threshold: float | None = None
+    """An episode ends when `stop_metric` exceeds this (the metric's unit)."""
     gospa_cutoff: float = _quantity(200.0, "m", 0.0, open_low=True)
     """GOSPA cut-off c; also the distance within which a track counts for a truth (m)."""
     gospa_order: float = _quantity(2.0, "1", 1.0)
@@ -177,6 +196,8 @@ def validate(static: StaticParams, params: Params) -> None:
             f"clutter_rate = {params.clutter_rate}: expected at most max_clutter = "
             f"{static.max_clutter} 1/look"
         )
+    if static.stop_metric is not None and params.stop_threshold is None:
+        raise ValueError(f"stop_threshold = None: expected a number for stop_metric = {static.stop_metric!r}")
     first = static.num_truths if params.initial_truths is None else np.asarray(params.initial_truths)
     if np.any(first < 0) or np.any(first > static.num_truths):
         raise ValueError(

@@ -1,7 +1,7 @@
 """Rewards by name: pure functions of the track list before and after a step.
 
 Every reward is ``track_weight * track term - search_weight * mean scan value``; they differ
-in the track term. None needs the truths.
+in the track term. Only `gospa` reads the truths, which no real radar knows.
 """
 
 from collections.abc import Callable
@@ -9,20 +9,23 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 
+from jaxtrack.metrics import gospa
 from jaxtrack.observation import covariance_norms
 from jaxtrack.params import Params, StaticParams
-from jaxtrack.types import NO_DETECTION, Tracks
+from jaxtrack.types import NO_DETECTION, Tracks, Truths
 
-TrackTerm = Callable[[Tracks, Tracks, StaticParams, Params], jax.Array]
+TrackTerm = Callable[[Tracks, Tracks, Truths, StaticParams, Params], jax.Array]
 
 
-def covariance_reduction(before: Tracks, after: Tracks, static: StaticParams, params: Params) -> jax.Array:
+def covariance_reduction(
+    before: Tracks, after: Tracks, truths: Truths, static: StaticParams, params: Params
+) -> jax.Array:
     """Fall of the covariance norm, summed over tracks detected now or one step ago.
 
     The paper prints the difference the other way round, which pays for growth, while its
     text says reduction: this follows the text. Divided by the deletion threshold.
     """
-    del static
+    del truths, static
     detected = (after.updated_by != NO_DETECTION) | (before.updated_by != NO_DETECTION)
     # A track born now has no norm before; its slot may have held another track.
     counts = after.active & detected & (after.age > 0)
@@ -30,33 +33,56 @@ def covariance_reduction(before: Tracks, after: Tracks, static: StaticParams, pa
     return jnp.sum(jnp.where(counts, fall, 0.0)) / params.deletion_threshold
 
 
-def covariance_growth(before: Tracks, after: Tracks, static: StaticParams, params: Params) -> jax.Array:
+def covariance_growth(
+    before: Tracks, after: Tracks, truths: Truths, static: StaticParams, params: Params
+) -> jax.Array:
     """The paper's track term with the sign as printed."""
-    return -covariance_reduction(before, after, static, params)
+    return -covariance_reduction(before, after, truths, static, params)
 
 
-def information(before: Tracks, after: Tracks, static: StaticParams, params: Params) -> jax.Array:
+def information(
+    before: Tracks, after: Tracks, truths: Truths, static: StaticParams, params: Params
+) -> jax.Array:
     """Sum over live tracks of ``max(0, 1 - trace(P) / threshold)``, per truth expected.
 
     Every live track is worth up to 1, a lost one nothing.
     """
-    del before
+    del before, truths
     trace = jnp.trace(after.covariance, axis1=-2, axis2=-1)
     worth = jnp.maximum(0.0, 1 - trace / params.deletion_threshold)
     return jnp.sum(jnp.where(after.active, worth, 0.0)) / static.num_truths
+
+
+def accuracy(
+    before: Tracks, after: Tracks, truths: Truths, static: StaticParams, params: Params
+) -> jax.Array:
+    """``1 - GOSPA / GOSPA without tracks``: 1 if every truth is tracked exactly, 0 without tracks.
+
+    Negative where false tracks cost more than the true ones gain.
+    """
+    del before, static
+    num_truths = jnp.maximum(jnp.sum(truths.alive), 1)
+    worst = params.gospa_cutoff * (num_truths / 2) ** (1 / params.gospa_order)
+    return 1 - gospa(truths, after, params).distance / worst
 
 
 TRACK_TERMS: dict[str, TrackTerm] = {
     "paper": covariance_reduction,
     "as_printed": covariance_growth,
     "information": information,
+    "gospa": accuracy,
 }
 
 
 def reward_terms(
-    before: Tracks, after: Tracks, scan_map: jax.Array, static: StaticParams, params: Params
+    before: Tracks,
+    after: Tracks,
+    truths: Truths,
+    scan_map: jax.Array,
+    static: StaticParams,
+    params: Params,
 ) -> tuple[jax.Array, jax.Array]:
     """Weighted track term and weighted search term (negative); the reward is their sum."""
-    track = params.track_weight * TRACK_TERMS[static.reward](before, after, static, params)
+    track = params.track_weight * TRACK_TERMS[static.reward](before, after, truths, static, params)
     search = -params.search_weight * jnp.mean(scan_map)
     return track, search

@@ -35,29 +35,29 @@ def snapshot(tracks: Iterable[Track]) -> Snapshot:
     }
 
 
-def track_term(before: Snapshot, after: Snapshot, static: StaticParams, params: Params) -> float:
+def track_term(
+    before: Snapshot, after: Snapshot, gospa: float, num_living: int, static: StaticParams, params: Params
+) -> float:
     """The track term of the reward that `static` names.
 
-    Raises:
-        ValueError: for a reward that is not rebuilt here.
+    Args:
+        before: the tracks before the step.
+        after: the tracks after it.
+        gospa: GOSPA distance after it (m), which only the reward of that name reads.
+        num_living: truths alive.
+        static: shapes.
+        params: numbers.
     """
+    if static.reward == "gospa":
+        worst = params.gospa_cutoff * (max(num_living, 1) / 2) ** (1 / params.gospa_order)
+        return 1 - gospa / worst
     if static.reward == "information":
         worth = (max(0.0, 1 - track.trace / params.deletion_threshold) for track in after.values())
         return sum(worth) / static.num_truths
     signs = {"paper": 1.0, "as_printed": -1.0}
-    if static.reward not in signs:
-        raise ValueError(f"reward = {static.reward!r}: expected information, paper or as_printed")
     fall = sum(
         before[track].norm - now.norm
         for track, now in after.items()
         if track in before and (now.detected or before[track].detected)
     )
     return signs[static.reward] * fall / params.deletion_threshold
-
-
-def reward_terms(
-    before: Snapshot, after: Snapshot, mean_scan_value: float, static: StaticParams, params: Params
-) -> tuple[float, float]:
-    """Weighted track term and weighted search term (negative); the reward is their sum."""
-    track = params.track_weight * track_term(before, after, static, params)
-    return track, -params.search_weight * mean_scan_value

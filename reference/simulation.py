@@ -8,6 +8,8 @@ reward are numpy.
 from collections.abc import Iterator
 
 import numpy as np
+from stonesoup.measures import Euclidean
+from stonesoup.metricgenerator.ospametric import GOSPAMetric
 from stonesoup.metricgenerator.uncertaintymetric import SumofCovarianceNormsMetric
 from stonesoup.types.array import StateVector
 from stonesoup.types.detection import Detection
@@ -15,10 +17,11 @@ from stonesoup.types.groundtruth import GroundTruthPath
 from stonesoup.types.track import Track
 
 from jaxtrack.params import Params, StaticParams
+from jaxtrack.types import POSITION
 from reference.components import build_components, time_of
 from reference.observation import ScanMap, TrackSlots, track_observation
 from reference.radar import build_radar, steer
-from reference.reward import reward_terms, snapshot
+from reference.reward import snapshot, track_term
 from reference.truths import Draws, Script, initial_states, num_initial, scripted_simulator, truth_simulator
 
 Observation = dict[str, np.ndarray]
@@ -27,7 +30,7 @@ Observation = dict[str, np.ndarray]
 class StoneSoupScenario:
     """One scenario of `SearchTrack-v0` in stock Stone Soup.
 
-    Clutter, missed detections and replayed trajectories are not simulated here. Stone Soup
+    Clutter, missed detections, replayed trajectories and stop criteria are not simulated here. Stone Soup
     knows no capacity: more tracks than slots are only left out of the observation.
 
     Args:
@@ -93,14 +96,16 @@ class StoneSoupScenario:
         self.slots.update(self.tracks)
         self.scan_map.look(azimuth, elevation)
         scan_value = float(self.scan_map.value.mean())
-        track, search = reward_terms(before, snapshot(self.tracks), scan_value, self.static, self.params)
+        gospa = self.gospa() if self.static.reward == "gospa" else 0.0
+        after, living = snapshot(self.tracks), len(self.paths)
+        track = track_term(before, after, gospa, living, self.static, self.params)
         return self.observe(), {
             "live_tracks": len(self.tracks),
             "num_detections": len(detections),
             "covariance_norm_sum": self.covariance_norm_sum(),
             "mean_scan_value": scan_value,
-            "reward_track": track,
-            "reward_search": search,
+            "reward_track": self.params.track_weight * track,
+            "reward_search": -self.params.search_weight * scan_value,
         }
 
     @property
@@ -138,6 +143,15 @@ class StoneSoupScenario:
         """Stone Soup's metric over the live tracks; 0 without tracks."""
         states = [track.state for track in self.tracks]
         return float(self.uncertainty.compute_covariancenorms(states).value) if states else 0.0
+
+    def gospa(self) -> float:
+        """Stone Soup's GOSPA distance (m) of the live tracks, positions only."""
+        generator = GOSPAMetric(
+            p=self.params.gospa_order, c=self.params.gospa_cutoff, measure=Euclidean(POSITION)
+        )
+        states = [track.state for track in self.tracks]
+        found = generator.compute_gospa_metric(states, [path[-1] for path in self.paths])[0].value
+        return float(found["distance"])
 
     def _move_truths(self) -> None:
         if self.script is not None:

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 import jaxtrack
-from jaxtrack import Params, SearchTrack, StaticParams
+from jaxtrack import Params, SearchTrack, StaticParams, make, metrics
 from jaxtrack.observation import observe
+from jaxtrack.params import METRICS
 
 SHAPES = {
     "num_truths": 3,
@@ -211,3 +212,42 @@ def test_recorded_truths_of_a_wrong_shape_are_refused(env):
     params = PARAMS.replace(trajectories=jnp.zeros((5, 2, 6)))
     with pytest.raises(ValueError, match=r"^trajectories has shape \(5, 2, 6\): expected"):
         env.reset(jax.random.key(0), params)
+
+
+@pytest.mark.usefixtures("quick_compilation")
+def test_metrics_can_be_asked_for_in_info():
+    env, params = make(**SHAPES, info_metrics=("gospa", "gospa_missed"))
+    _, state = env.reset(jax.random.key(0), params)
+    _, state, _, _, _, info = env.step(jax.random.key(1), state, jnp.array([2, 2]), params)
+    found = metrics.gospa(state.truths, state.tracks, params)
+    assert float(info["gospa"]) == pytest.approx(float(found.distance))
+    assert float(info["gospa_missed"]) == pytest.approx(float(found.missed))
+
+
+@pytest.mark.usefixtures("quick_compilation")
+@pytest.mark.parametrize(("threshold", "terminated"), [(1e9, False), (1.0, True)])
+def test_a_metric_can_stop_an_episode(threshold, terminated):
+    """Without tracks GOSPA is at its worst, 200 m per truth or so."""
+    env, params = make(**SHAPES, stop_metric="gospa", stop_threshold=threshold)
+    _, state = env.reset(jax.random.key(0), params)
+    _, state, _, ended, truncated, _ = env.step(jax.random.key(1), state, jnp.array([2, 2]), params)
+    assert bool(ended) is terminated
+    assert not bool(truncated)
+    assert int(state.time) == (0 if terminated else 1)
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"info_metrics": ("ospa",)}, "info_metrics = 'ospa': expected one of gospa, "),
+        ({"stop_metric": "ospa", "stop_threshold": 1.0}, "stop_metric = 'ospa': expected one of gospa, "),
+        ({"stop_metric": "gospa"}, "stop_threshold = None: expected a number for stop_metric = 'gospa'"),
+    ],
+)
+def test_metrics_that_do_not_exist_are_refused(fields, message):
+    with pytest.raises(ValueError, match=message):
+        make(**fields)
+
+
+def test_every_name_of_a_metric_has_its_function():
+    assert set(METRICS) == set(metrics.METRICS)

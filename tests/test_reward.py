@@ -4,13 +4,21 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxtrack import NO_DETECTION, Params, StaticParams, Tracks
+from jaxtrack import NO_DETECTION, Params, StaticParams, Tracks, Truths
 from jaxtrack.params import REWARDS
-from jaxtrack.reward import TRACK_TERMS, covariance_growth, covariance_reduction, information, reward_terms
+from jaxtrack.reward import (
+    TRACK_TERMS,
+    accuracy,
+    covariance_growth,
+    covariance_reduction,
+    information,
+    reward_terms,
+)
 
 STATIC = StaticParams(num_truths=4)
 PARAMS = Params(deletion_threshold=1000.0)
 NONE = NO_DETECTION
+NOBODY = Truths(state=jnp.zeros((4, 6)), alive=jnp.zeros(4, dtype=bool))
 
 
 def track_list(norms, updated_by, ages=None, active=None):
@@ -25,7 +33,7 @@ def track_list(norms, updated_by, ages=None, active=None):
 
 
 def reduction(before, after):
-    return float(covariance_reduction(before, after, STATIC, PARAMS))
+    return float(covariance_reduction(before, after, NOBODY, STATIC, PARAMS))
 
 
 def test_only_tracks_detected_now_or_one_step_ago_count():
@@ -57,19 +65,19 @@ def test_the_norm_is_that_of_the_whole_matrix():
 
 def test_as_printed_is_the_opposite_sign():
     before, after = track_list([500], [NONE]), track_list([100], [0])
-    assert float(covariance_growth(before, after, STATIC, PARAMS)) == pytest.approx(-0.4)
+    assert float(covariance_growth(before, after, NOBODY, STATIC, PARAMS)) == pytest.approx(-0.4)
 
 
 def test_information_pays_for_every_certain_live_track():
     before = track_list([9, 9, 9, 9], [0, 0, 0, 0])
     after = track_list([0, 250, 1500, 100], [NONE] * 4, active=[True, True, True, False])
     # 1 + 0.75 + 0 for the lost one, over 4 truths; the empty slot counts nothing.
-    assert float(information(before, after, STATIC, PARAMS)) == pytest.approx(1.75 / 4)
+    assert float(information(before, after, NOBODY, STATIC, PARAMS)) == pytest.approx(1.75 / 4)
 
 
 def test_information_uses_the_trace():
     after = track_list([0], [0]).replace(covariance=jnp.full((1, 6, 6), 50.0))
-    assert float(information(after, after, STATIC, PARAMS)) == pytest.approx((1 - 0.3) / 4)
+    assert float(information(after, after, NOBODY, STATIC, PARAMS)) == pytest.approx((1 - 0.3) / 4)
 
 
 @pytest.mark.parametrize(("name", "track"), [("paper", 0.4), ("as_printed", -0.4), ("information", 0.225)])
@@ -78,9 +86,26 @@ def test_rewards_by_name_are_weighted_and_searching_costs_the_mean_scan_value(na
     params = PARAMS.replace(track_weight=3.0, search_weight=0.5)
     scan_map = jnp.array([[0.0, 1.0], [0.5, 0.1]])
     before, after = track_list([500], [NONE]), track_list([100], [0])
-    track_term, search_term = reward_terms(before, after, scan_map, static, params)
+    track_term, search_term = reward_terms(before, after, NOBODY, scan_map, static, params)
     assert float(track_term) == pytest.approx(3 * track)
     assert float(search_term) == pytest.approx(-0.5 * 0.4)
+
+
+def test_gospa_is_worth_one_for_perfect_tracks_and_nothing_without_any():
+    params = PARAMS.replace(gospa_cutoff=100.0)
+    state = jnp.zeros((4, 6)).at[:, 0].set(jnp.array([1000.0, 3000.0, 5000.0, 7000.0]))
+    truths = Truths(state=state, alive=jnp.array([True, True, False, False]))
+
+    def worth(means, active):
+        after = track_list([1.0] * 4, [NONE] * 4, active=active).replace(mean=means)
+        return float(accuracy(after, after, truths, STATIC, params))
+
+    assert worth(state, [True, True, False, False]) == pytest.approx(1.0)
+    assert worth(state, [False] * 4) == pytest.approx(0.0)
+    # One truth missed costs c^2 / 2 of 2 c^2 / 2 in the square.
+    assert worth(state, [True, False, False, False]) == pytest.approx(1 - np.sqrt(0.5))
+    # Four tracks, two of them false, none on a truth: sqrt(6/2) against sqrt(2/2).
+    assert worth(state + 500, [True] * 4) == pytest.approx(1 - np.sqrt(3.0))
 
 
 def test_every_name_of_a_reward_has_its_function():

@@ -3,7 +3,7 @@
 import dataclasses
 import math
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any, get_args, get_origin
 
 from jaxtrack.params import Params, StaticParams, validate
 from train.agents import AGENTS
@@ -169,11 +169,20 @@ def from_dict(values: dict[str, Any]) -> TrainConfig:
 def _replace(default: Any, values: dict[str, Any], prefix: str) -> Any:
     if not isinstance(values, dict):
         raise ValueError(f"{prefix.rstrip('.')} = {values!r}: expected a table of fields")
-    known = {field.name: get_args(field.type) or (field.type,) for field in dataclasses.fields(default)}
+    known = {field.name: _kinds(field.type) for field in dataclasses.fields(default)}
     for name, value in values.items():
         if name not in known:
             raise ValueError(f"{prefix}{name}: no such field; expected one of {', '.join(sorted(known))}")
         allowed = (*known[name], int) if float in known[name] else known[name]
         if not isinstance(value, allowed) or (isinstance(value, bool) and bool not in allowed):
             raise ValueError(f"{prefix}{name} = {value!r}: expected {known[name][0].__name__}")
-    return dataclasses.replace(default, **values)
+    # JSON and TOML have no tuples.
+    frozen = {name: tuple(value) if isinstance(value, list) else value for name, value in values.items()}
+    return dataclasses.replace(default, **frozen)
+
+
+def _kinds(annotation: Any) -> tuple[type, ...]:
+    """Types that a field takes."""
+    if get_origin(annotation) is tuple:
+        return list, tuple
+    return get_args(annotation) or (annotation,)

@@ -85,7 +85,7 @@ def step_metrics(before: EnvState, after: EnvState, env: SearchTrack, params: Pa
     """Every metric of one step."""
     truths, tracks = after.truths, after.tracks
     gospa = metrics.gospa(truths, tracks, params)
-    reward = reward_terms(before.tracks, tracks, after.scan_map, env.static, params)
+    reward = reward_terms(before.tracks, tracks, after.truths, after.scan_map, env.static, params)
     return {
         "gospa": gospa.distance,
         "gospa_localisation": gospa.localisation,

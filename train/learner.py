@@ -123,7 +123,7 @@ def collect(
 ) -> tuple[LearnerState, Transition, dict[str, jax.Array]]:
     """Runs every environment for `rollout_steps` steps with the current weights."""
 
-    def one_step(carry: LearnerState, key: jax.Array) -> tuple[LearnerState, tuple[Transition, Any]]:
+    def one_step(carry: LearnerState, key: jax.Array) -> tuple[LearnerState, tuple[Transition, Any, Any]]:
         key_action, key_env = jax.random.split(key)
         logits, value = agent.evaluate(carry.weights, carry.inputs)
         action = agent.distribution.sample(key_action, logits)
@@ -144,17 +144,18 @@ def collect(
         )
         episode_return, episode_length = carry.episode_return + reward, carry.episode_length + 1
         finished = {"done": done, "episode_return": episode_return, "episode_length": episode_length}
+        logged = {"reward": reward} | {name: info[name] for name in (*LOGGED, *env.static.info_metrics)}
         carry = carry.replace(
             env=env_state,
             inputs=jax.vmap(agent.features)(observation),
             episode_return=jnp.where(done, 0.0, episode_return),
             episode_length=jnp.where(done, 0, episode_length),
         )
-        return carry, (transition, {**finished, "reward": reward, **{name: info[name] for name in LOGGED}})
+        return carry, (transition, finished | {"terminated": terminated}, logged)
 
     keys = jax.random.split(key, config.rollout_steps)
-    state, (rollout, steps) = jax.lax.scan(one_step, state, keys)
-    return state, rollout, summarise(steps, state.scenario)
+    state, (rollout, finished, logged) = jax.lax.scan(one_step, state, keys)
+    return state, rollout, summarise(finished, logged, state.scenario)
 
 
 def value_at_end(weights: Any, final_observation: Any, done: jax.Array, agent: Agent) -> jax.Array:
@@ -265,12 +266,16 @@ def ppo_loss(
     }
 
 
-def summarise(steps: dict[str, jax.Array], params: Params) -> dict[str, jax.Array]:
+def summarise(
+    finished: dict[str, jax.Array], logged: dict[str, jax.Array], params: Params
+) -> dict[str, jax.Array]:
     """Means over a rollout; episode returns over whole episodes only, NaN where none ended."""
-    whole = steps["done"] & (steps["episode_length"] == params.max_steps_in_episode)
+    # The first episodes are cut short by the different times at which they start.
+    whole = finished["terminated"] | (finished["episode_length"] == params.max_steps_in_episode)
+    whole &= finished["done"]
     count = whole.sum()
-    total = jnp.where(whole, steps["episode_return"], 0.0).sum()
-    means = {name: steps[name].mean() for name in ("reward", *LOGGED)}
+    total = jnp.where(whole, finished["episode_return"], 0.0).sum()
+    means = {name: values.mean() for name, values in logged.items()}
     return {**means, "episodes": count, "episode_return": jnp.where(count > 0, total / count, jnp.nan)}
 
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from jaxtrack import models
 from jaxtrack.env import EnvState, SearchTrack, StepNoise
-from jaxtrack.params import Params, StaticParams
+from jaxtrack.params import REWARDS, Params, StaticParams
 from jaxtrack.reward import reward_terms
 from jaxtrack.sampling import poisson_quantile
 from jaxtrack.truth import born_state
@@ -33,8 +33,6 @@ LIVELY = Params(
     time_step=0.02, deletion_threshold=3500.0, initial_truths=6, birth_rate=0.03, death_probability=0.004
 )
 """Long steps, so that tracks die within an episode; truths are born and die."""
-
-REWARDS = ("paper", "information", "as_printed")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -84,7 +82,7 @@ def _episode(key: jax.Array, params: Params, static: StaticParams, steps: int) -
         noise = env.sample_noise(key_noise)
         after, _ = env.advance(state, action, noise, params)
         rewards = {
-            name: sum(reward_terms(state.tracks, after.tracks, after.scan_map, named, params))
+            name: sum(reward_terms(state.tracks, after.tracks, after.truths, after.scan_map, named, params))
             for name, named in by_reward.items()
         }
         return after, (after.truths, noise, action, env.observe(key, after, action, params), rewards)

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 from flax import linen as nn
 from flax import struct
 
+from jaxtrack import StaticParams
 from train import learner
 
 LOOKS = 2
@@ -20,7 +21,7 @@ class ProbeState(struct.PyTreeNode):
 class Probe:
     """Reward is a function of (time, coin, action); the observation is time and coin, one-hot."""
 
-    static = None
+    static = StaticParams()
 
     def __init__(self, reward, length, terminates=False):
         self.reward, self.length, self.terminates = reward, length, terminates

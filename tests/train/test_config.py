@@ -118,6 +118,8 @@ def changed(config):
             fields[field.name] = changed(value)
         elif field.name in CHOICES:
             fields[field.name] = CHOICES[field.name]
+        elif isinstance(value, tuple):
+            fields[field.name] = (*value, "gospa")
         elif isinstance(value, str):
             fields[field.name] = value + "other"
         elif value is not None:

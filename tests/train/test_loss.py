@@ -151,8 +151,10 @@ def test_explained_variance():
 
 
 def test_without_a_whole_episode_the_return_is_nan():
-    steps = {"done": jnp.array([[True]]), "episode_length": jnp.array([[3]])}
-    steps |= {name: jnp.ones((1, 1)) for name in ("episode_return", "reward", *learner.LOGGED)}
-    summary = learner.summarise(steps, Params(max_steps_in_episode=4))
+    finished = {"done": jnp.array([[True]]), "episode_length": jnp.array([[3]])}
+    finished |= {"episode_return": jnp.ones((1, 1)), "terminated": jnp.array([[False]])}
+    summary = learner.summarise(finished, {"reward": jnp.ones((1, 1))}, Params(max_steps_in_episode=4))
     assert summary["episodes"] == 0
     assert np.isnan(summary["episode_return"])
+    ended = finished | {"terminated": jnp.array([[True]])}
+    assert learner.summarise(ended, {}, Params(max_steps_in_episode=4))["episodes"] == 1
