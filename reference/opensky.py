@@ -24,7 +24,8 @@ from jaxtrack.params import Params, StaticParams, validate
 from jaxtrack.track import TRACKER_FIELDS
 from jaxtrack.trajectories import AIRCRAFT, MAX_AGE, Recording, read_opensky
 from jaxtrack.types import Detections
-from reference.side_by_side import Comparison, Quality, Run, compare, judge, run_jaxtrack, run_stone_soup
+from reference.parity.episodes import Comparison, compare_records
+from reference.side_by_side import Quality, Run, judge, run_jaxtrack, run_stone_soup
 from reference.virtual_radar import observe_aircraft, scan_interval, write_detections
 
 if TYPE_CHECKING:
@@ -114,8 +115,14 @@ class Result:
             "seconds": self.run.seconds,
             "compile_seconds": self.run.compile_seconds,
             **dataclasses.asdict(self.quality),
-            **({**dataclasses.asdict(compared), "agreement": compared.agreement} if compared else {}),
+            **(comparison_figures(compared) if compared else {}),
         }
+
+
+def comparison_figures(compared: Comparison) -> dict[str, Any]:
+    """All figures of a comparison, for the JSON file."""
+    figures = {**dataclasses.asdict(compared), "decisions": compared.decisions}
+    return {**figures, "agreement": compared.agreement, "divergence": str(compared.divergence or "")}
 
 
 def side_by_side(options: Options, recording: Recording) -> tuple[Detections, list[Result]]:
@@ -128,7 +135,7 @@ def side_by_side(options: Options, recording: Recording) -> tuple[Detections, li
     results = [Result("jaxtrack", ours, judge(ours.records, detections, states))]
     for exact in (True, False) if options.stone_soup else ():
         theirs = run_stone_soup(detections, params, exact, sys.stderr.isatty())
-        compared = compare(ours.records, theirs.records, ROUNDING if exact else math.inf)
+        compared = compare_records(ours.records, theirs.records, ROUNDING if exact else math.inf)
         name = f"Stone Soup, {'exact' if exact else 'stock'} Jacobian"
         results.append(Result(name, theirs, judge(theirs.records, detections, states), compared))
     return detections, results
@@ -152,8 +159,8 @@ def print_table(results: list[Result]) -> None:
         table.add_row(*row)
     wide_console().print(table)
     for result in results:
-        if result.comparison and result.comparison.first:
-            print(f"first difference from {result.name}: {result.comparison.first}")
+        if result.comparison and result.comparison.divergence:
+            print(f"first difference from {result.name}: {result.comparison.divergence}")
 
 
 def draw(recording: Recording, scans: int, ours: Run) -> "Figure":
@@ -221,7 +228,7 @@ def main(argv: Sequence[str]) -> int:
     print_table(results)
     found = int(detections.active.sum())
     print(f"{options.out}: detections.csv ({found} detections), tracker.json, opensky.json, opensky.png")
-    return int(any(result.comparison and result.comparison.first for result in results))
+    return int(any(result.comparison and result.comparison.divergence for result in results))
 
 
 if __name__ == "__main__":

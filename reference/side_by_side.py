@@ -3,7 +3,7 @@
 import dataclasses
 import time
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from typing import Any
 
 import jax
@@ -13,11 +13,9 @@ import numpy as np
 from jaxtrack import tracker
 from jaxtrack.params import Params
 from jaxtrack.types import NO_DETECTION, NO_TRUTH, Detections, Tracks
-from reference.parity.compare import covariance_error, mean_error
-from reference.pipeline import Estimate, StepRecord, StoneSoupTracker
-from reference.translate import TrackKey, slot_keys
-
-STATE_NAMES = ("x", "vx", "y", "vy", "z", "vz")
+from reference.parity.episodes import to_records
+from reference.pipeline import StepRecord, StoneSoupTracker
+from reference.translate import TrackKey
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,32 +33,6 @@ class Run:
     compile_seconds: float = 0.0
 
 
-@dataclasses.dataclass(frozen=True)
-class Comparison:
-    """How equal two runs are.
-
-    Attributes:
-        decisions: births, associations and deletions compared.
-        different: how many of them differ.
-        estimates: means and covariances compared.
-        mean_error: largest error of a mean (standard deviations).
-        covariance_error: largest error of a covariance (of the product of standard deviations).
-        first: the first difference, in words; empty without one.
-    """
-
-    decisions: int
-    different: int
-    estimates: int
-    mean_error: float
-    covariance_error: float
-    first: str
-
-    @property
-    def agreement(self) -> float:
-        """Share of the decisions that are the same."""
-        return 1 - self.different / max(self.decisions, 1)
-
-
 def run_jaxtrack(detections: Detections, params: Params) -> Run:
     """Our tracker on detections `[K, D]`; track slots are doubled until nothing is dropped."""
 
@@ -68,8 +40,7 @@ def run_jaxtrack(detections: Detections, params: Params) -> Run:
     def play(detections: Detections, tracks: Tracks) -> Any:
         def one_scan(carry: tuple[Tracks, jax.Array], now: Detections) -> Any:
             tracks, info = tracker.step(carry[0], now, params.time_step, carry[1], params)
-            kept = (info.associated, info.updated, info.deleted, info.initiated, info.num_dropped)
-            return (tracks, carry[1] + 1), (tracks, *kept)
+            return (tracks, carry[1] + 1), (tracks, info)
 
         return jax.lax.scan(one_scan, (tracks, jnp.asarray(1)), detections)[1]
 
@@ -79,44 +50,10 @@ def run_jaxtrack(detections: Detections, params: Params) -> Run:
         started = time.perf_counter()
         played = play.lower(detections, Tracks.empty(slots)).compile()
         compiled = time.perf_counter()
-        made = jax.device_get(jax.block_until_ready(played(detections, Tracks.empty(slots))))
+        after, info = jax.device_get(jax.block_until_ready(played(detections, Tracks.empty(slots))))
         seconds = time.perf_counter() - compiled
-        if not made[-1].any():
-            return Run(to_records(*made[:-1]), seconds, compiled - started)
-
-
-def to_records(
-    after: Tracks, associated: np.ndarray, updated: Tracks, deleted: np.ndarray, initiated: np.ndarray
-) -> list[StepRecord]:
-    """Our results `[K, T]` as Stone Soup's are recorded, so that one comparison serves both."""
-    records = []
-    for k in range(len(deleted)):
-        now, moved = (jax.tree.map(lambda leaf, k=k: leaf[k], tracks) for tracks in (after, updated))
-        before, keys = live_slots(moved), live_slots(now)
-        rows = {key: int(associated[k, slot]) for key, slot in before.items()}
-        records.append(
-            StepRecord(
-                step=k + 1,
-                expected={},
-                associated={key: row for key, row in rows.items() if row != NO_DETECTION},
-                updated=estimates(moved, before),
-                deleted={key for key, slot in before.items() if deleted[k, slot]},
-                initiated={key for key, slot in keys.items() if initiated[k, slot]},
-                live=estimates(now, keys),
-            )
-        )
-    return records
-
-
-def live_slots(tracks: Tracks) -> dict[TrackKey, int]:
-    """The slot of every live track."""
-    return {key: slot for slot, key in enumerate(slot_keys(tracks)) if key}
-
-
-def estimates(tracks: Tracks, slots: dict[TrackKey, int]) -> dict[TrackKey, Estimate]:
-    """Estimates of tracks by their slots."""
-    mean, covariance = np.asarray(tracks.mean), np.asarray(tracks.covariance)
-    return {key: Estimate(mean[slot], covariance[slot]) for key, slot in slots.items()}
+        if not info.num_dropped.any():
+            return Run(to_records(after, info, len(info.num_dropped)), seconds, compiled - started)
 
 
 def run_stone_soup(detections: Detections, params: Params, exact_jacobian: bool, progress: bool) -> Run:
@@ -131,66 +68,6 @@ def run_stone_soup(detections: Detections, params: Params, exact_jacobian: bool,
     started = time.perf_counter()
     records = [oracle.step(value, active) for value, active in scans]
     return Run(records, time.perf_counter() - started)
-
-
-def compare(ours: list[StepRecord], theirs: list[StepRecord], tolerance: float) -> Comparison:
-    """Compares every birth, association, deletion and estimate of every scan.
-
-    Args:
-        ours: records of jaxtrack.
-        theirs: records of Stone Soup, of the same scans.
-        tolerance: an estimate that is further off than this (standard deviations) is a
-            difference worth naming; infinite where only decisions count.
-    """
-    decisions = different = compared = 0
-    largest_mean = largest_covariance = 0.0
-    first = ""
-    for our, their in zip(ours, theirs, strict=True):
-        for words, ours_says, theirs_says in _decisions(our, their):
-            decisions += 1
-            if ours_says != theirs_says:
-                different += 1
-                first = first or f"{words}: {ours_says} in jaxtrack, {theirs_says} in Stone Soup"
-        for key in sorted(our.live.keys() & their.live.keys()):
-            compared += 1
-            a, b = our.live[key], their.live[key]
-            errors = mean_error(a.mean, b.mean, b.covariance), covariance_error(a.covariance, b.covariance)
-            largest_mean = float(np.maximum(largest_mean, errors[0]))  # keeps NaN
-            largest_covariance = float(np.maximum(largest_covariance, errors[1]))
-            if not (errors[0] <= tolerance and errors[1] <= tolerance):
-                first = first or _worst_entry(our.step, key, a, b, errors)
-    return Comparison(decisions, different, compared, largest_mean, largest_covariance, first)
-
-
-def _decisions(our: StepRecord, their: StepRecord) -> Iterator[tuple[str, Any, Any]]:
-    """Every decision of one scan: what it is about, and what both sides say."""
-    for key in sorted(our.updated.keys() | their.updated.keys()):
-        about = f"scan {our.step}, track {key}"
-        yield (
-            f"{about}, associated detection",
-            our.associated.get(key, NO_DETECTION),
-            their.associated.get(key, NO_DETECTION),
-        )
-        yield f"{about}, deleted", key in our.deleted, key in their.deleted
-    for key in sorted(our.initiated | their.initiated):
-        yield f"scan {our.step}, track {key}, born", key in our.initiated, key in their.initiated
-
-
-def _worst_entry(step: int, key: TrackKey, a: Estimate, b: Estimate, errors: tuple[float, float]) -> str:
-    """In words: the entry of one track's estimate that is furthest off in standard deviations."""
-    sigma = np.sqrt(np.diag(b.covariance))
-    if np.argmax(errors) == 0:  # the first NaN, where there is one
-        i = int(np.argmax(np.abs(a.mean - b.mean) / sigma))
-        entry, ours, theirs = f"mean of {STATE_NAMES[i]}", a.mean[i], b.mean[i]
-    else:
-        off = np.abs(a.covariance - b.covariance) / np.outer(sigma, sigma)
-        i, j = divmod(int(np.argmax(off)), len(sigma))
-        entry = f"covariance of {STATE_NAMES[i]} and {STATE_NAMES[j]}"
-        ours, theirs = a.covariance[i, j], b.covariance[i, j]
-    return (
-        f"scan {step}, track {key}, {entry}: {float(ours)!r} in jaxtrack, {float(theirs)!r} in Stone Soup "
-        f"({np.max(errors):.1e} standard deviations apart)"
-    )
 
 
 @dataclasses.dataclass(frozen=True)

@@ -42,19 +42,23 @@ class Divergence:
 
 @dataclasses.dataclass
 class Comparison:
-    """What came out of one episode.
+    """What came out of one episode, up to its first divergence or exact tie.
 
     Attributes:
-        steps: steps compared; fewer than there are where an exact tie or a divergence ended it.
-        error: largest error, in standard deviations of the quantity.
-        birth_error: the same over newborn tracks only.
-        updates, births, deletions: how often each happened.
+        steps: steps that agree.
+        mean_error: largest error of a mean, in its standard deviations.
+        covariance_error: largest error of a covariance, in products of standard deviations.
+        birth_error: the larger of the two over newborn tracks only.
+        updates: associations that agree.
+        births: births that agree.
+        deletions: deletions that agree.
         tie: whether an exact tie ended the comparison.
         divergence: the first difference, None if there is none.
     """
 
     steps: int = 0
-    error: float = 0.0
+    mean_error: float = 0.0
+    covariance_error: float = 0.0
     birth_error: float = 0.0
     updates: int = 0
     births: int = 0
@@ -63,9 +67,19 @@ class Comparison:
     divergence: Divergence | None = None
 
     @property
+    def error(self) -> float:
+        """The larger error."""
+        return max(self.mean_error, self.covariance_error)
+
+    @property
     def decisions(self) -> int:
         """Associations, births and deletions that agree."""
         return self.updates + self.births + self.deletions
+
+    @property
+    def agreement(self) -> float:
+        """Share of the decisions that agree; a divergence counts as one that does not."""
+        return self.decisions / max(self.decisions + (self.divergence is not None), 1)
 
 
 class EpisodeTallies:
@@ -101,7 +115,7 @@ def compare_episode(
     params: Params,
     tolerance: float,
 ) -> Comparison:
-    """Compares every step until the first divergence or exact tie.
+    """Compares an episode of ours with Stone Soup's until the first divergence or exact tie.
 
     Args:
         records: Stone Soup's steps.
@@ -111,22 +125,12 @@ def compare_episode(
         params: numbers of the tracker.
         tolerance: largest error, in standard deviations, that is no divergence.
     """
-    result = Comparison()
-    before: list[TrackKey | None] = [None] * tracks.active.shape[1]
-    for k, record in enumerate(records):
-        now, made = (jax.tree.map(lambda leaf, k=k: leaf[k], tree) for tree in (tracks, info))
-        if is_tied(made, active[k], params):
-            result.tie = True
+    for k in range(len(records)):
+        if is_tied(jax.tree.map(lambda leaf, k=k: leaf[k], info), active[k], params):
+            result = compare_records(to_records(tracks, info, k), records[:k], tolerance)
+            result.tie = result.divergence is None
             return result
-        after = slot_keys(now)
-        result.divergence = decision_divergence(record, before, after, made)
-        if result.divergence is None:
-            result.divergence = compare_estimates(record, after, now, tolerance, result)
-        if result.divergence is not None:
-            return result
-        count_decisions(record, result)
-        before = after
-    return result
+    return compare_records(to_records(tracks, info, len(records)), records, tolerance)
 
 
 def is_tied(info: TrackerInfo, active: np.ndarray, params: Params) -> bool:
@@ -142,56 +146,99 @@ def _repeats(distances: np.ndarray) -> bool:
     ordered = np.sort(distances, axis=1)
     low, high = ordered[:, :-1], ordered[:, 1:]
     competing = np.isfinite(high)
-    return bool(
-        np.any(competing & (np.where(competing, high, 0) - np.where(competing, low, 0) <= TIE * high))
-    )
+    return bool(np.any(high[competing] - low[competing] <= TIE * high[competing]))
 
 
-def decision_divergence(
-    record: StepRecord,
-    before: list[TrackKey | None],
-    after: list[TrackKey | None],
-    info: TrackerInfo,
-) -> Divergence | None:
+def to_records(tracks: Tracks, info: TrackerInfo, steps: int) -> list[StepRecord]:
+    """Our first steps in the form of Stone Soup's, without predictions.
+
+    Args:
+        tracks: `[K, T]` track lists after every step.
+        info: `[K]` intermediates; `associated`, `updated`, `deleted` and `initiated` are read.
+        steps: how many.
+    """
+    records = []
+    for k in range(steps):
+        after, updated = (jax.tree.map(lambda leaf, k=k: leaf[k], part) for part in (tracks, info.updated))
+        before, now = live_slots(updated), live_slots(after)
+        rows = {key: int(info.associated[k, slot]) for key, slot in before.items()}
+        records.append(
+            StepRecord(
+                step=k + 1,
+                expected={},
+                associated={key: row for key, row in rows.items() if row != NO_DETECTION},
+                updated=estimates(updated, before),
+                deleted={key for key, slot in before.items() if info.deleted[k, slot]},
+                initiated={key for key, slot in now.items() if info.initiated[k, slot]},
+                live=estimates(after, now),
+            )
+        )
+    return records
+
+
+def live_slots(tracks: Tracks) -> dict[TrackKey, int]:
+    """The slot of every live track."""
+    return {key: slot for slot, key in enumerate(slot_keys(tracks)) if key}
+
+
+def estimates(tracks: Tracks, slots: dict[TrackKey, int]) -> dict[TrackKey, Estimate]:
+    """Estimates of tracks by their slots."""
+    mean, covariance = np.asarray(tracks.mean, float), np.asarray(tracks.covariance, float)
+    return {key: Estimate(mean[slot], covariance[slot]) for key, slot in slots.items()}
+
+
+def compare_records(ours: list[StepRecord], theirs: list[StepRecord], tolerance: float) -> Comparison:
+    """Compares every decision and estimate of every step until the first divergence.
+
+    Args:
+        ours: our steps.
+        theirs: Stone Soup's, of the same scans.
+        tolerance: largest error, in standard deviations, that is no divergence.
+    """
+    result = Comparison()
+    for our, their in zip(ours, theirs, strict=True):
+        result.divergence = decision_divergence(our, their)
+        if result.divergence is None:
+            result.divergence = compare_estimates(our, their, tolerance, result)
+        if result.divergence is not None:
+            return result
+        result.steps += 1
+        result.updates += len(their.associated)
+        result.births += len(their.initiated)
+        result.deletions += len(their.deleted)
+    return result
+
+
+def decision_divergence(our: StepRecord, their: StepRecord) -> Divergence | None:
     """The first of association, deletion, birth and track list that differs."""
-    associated = {
-        key: int(row) for key, row in zip(before, info.associated, strict=True) if key and row != NO_DETECTION
-    }
-    for key in sorted(associated.keys() | record.associated.keys()):
-        ours, theirs = associated.get(key, NO_DETECTION), record.associated.get(key, NO_DETECTION)
-        if ours != theirs:
-            return Divergence(record.step, key, "associated detection", ours, theirs)
-    deleted = {key for key, gone in zip(before, info.deleted, strict=True) if key and gone}
-    initiated = {key for key, born in zip(after, info.initiated, strict=True) if key and born}
-    live = {key for key in after if key}
-    for quantity, mine, stock in (
-        ("deleted", deleted, record.deleted),
-        ("initiated", initiated, record.initiated),
-        ("live", live, set(record.live)),
-    ):
+    for key in sorted(our.associated.keys() | their.associated.keys()):
+        rows = our.associated.get(key, NO_DETECTION), their.associated.get(key, NO_DETECTION)
+        if rows[0] != rows[1]:
+            return Divergence(their.step, key, "associated detection", *rows)
+    for quantity in ("deleted", "initiated", "live"):
+        mine, stock = set(getattr(our, quantity)), set(getattr(their, quantity))
         for key in sorted(mine ^ stock):
-            return Divergence(record.step, key, quantity, key in mine, key in stock)
+            return Divergence(their.step, key, quantity, key in mine, key in stock)
     return None
 
 
 def compare_estimates(
-    record: StepRecord, after: list[TrackKey | None], tracks: Tracks, tolerance: float, result: Comparison
+    our: StepRecord, their: StepRecord, tolerance: float, result: Comparison
 ) -> Divergence | None:
-    """Adds the errors of every live track to the result; the first one beyond the tolerance."""
-    for slot, key in enumerate(after):
-        if key is None:
-            continue
-        theirs = record.live[key]
-        ours = Estimate(np.asarray(tracks.mean[slot], float), np.asarray(tracks.covariance[slot], float))
-        for quantity, errors in estimate_errors(ours, theirs).items():
-            if not errors.max() <= tolerance:
+    """Adds the errors of every live track to the result; the first entry beyond the tolerance."""
+    for key, stock in their.live.items():
+        ours = our.live[key]
+        for quantity, errors in estimate_errors(ours, stock).items():
+            largest = float(errors.max())
+            if not largest <= tolerance:
                 worst = tuple(int(i) for i in np.unravel_index(np.argmax(errors), errors.shape))
-                values = getattr(ours, quantity)[worst], getattr(theirs, quantity)[worst]
-                what = f"{quantity}{list(worst)} ({errors.max():.1e} sigma apart)"
-                return Divergence(record.step, key, what, *map(float, values))
-            result.error = max(result.error, float(errors.max()))
-            if key in record.initiated:
-                result.birth_error = max(result.birth_error, float(errors.max()))
+                values = getattr(ours, quantity)[worst], getattr(stock, quantity)[worst]
+                what = f"{quantity}{list(worst)} ({largest:.1e} sigma apart)"
+                return Divergence(their.step, key, what, *map(float, values))
+            name = f"{quantity}_error"
+            setattr(result, name, max(getattr(result, name), largest))
+            if key in their.initiated:
+                result.birth_error = max(result.birth_error, largest)
     return None
 
 
@@ -202,11 +249,3 @@ def estimate_errors(ours: Estimate, theirs: Estimate) -> dict[str, np.ndarray]:
         "mean": np.abs(ours.mean - theirs.mean) / sigma,
         "covariance": np.abs(ours.covariance - theirs.covariance) / np.outer(sigma, sigma),
     }
-
-
-def count_decisions(record: StepRecord, result: Comparison) -> None:
-    """Counts what happened on a step that agrees."""
-    result.steps += 1
-    result.updates += len(record.associated)
-    result.births += len(record.initiated)
-    result.deletions += len(record.deleted)
