@@ -12,6 +12,7 @@ from jaxtrack import NO_DETECTION, Detections, Params
 from jaxtrack import params as params_module
 from jaxtrack.association import MEASURES, associate_nearest_neighbour, gate, mahalanobis
 from jaxtrack.kalman import ExpectedDetections
+from jaxtrack.models import wrap_detection
 
 INF = np.inf
 associate = jax.jit(associate_nearest_neighbour)
@@ -80,6 +81,30 @@ def test_measures_by_hand(x64):
     for name, value in by_hand.items():
         ours = jax.jit(MEASURES[name])(expected, detections, PARAMS)
         np.testing.assert_allclose(ours, [[value]], rtol=1e-12, err_msg=name)
+
+
+@pytest.mark.parametrize("name", list(MEASURES))
+def test_every_pair_is_measured_for_itself_and_round_the_back_too(name, x64):
+    """Two tracks and three detections; then all of it turned across the seam of bearings."""
+    R = np.array([PARAMS.elevation_sigma, PARAMS.bearing_sigma, PARAMS.range_sigma]) ** 2
+    correlated = np.diag(2 * R)
+    correlated[0, 2] = correlated[2, 0] = np.sqrt(R[0] * R[2])
+    S = jnp.stack([jnp.asarray(correlated), jnp.diag(5 * R)])
+    means = np.array([[0.1, -1e-3, 1000.0], [0.1, 2e-3, 1005.0]])
+    values = np.array([[0.101, 1e-3, 1002.0], [0.1, 4e-3, 1000.0], [0.098, -2e-3, 1010.0]])
+
+    @jax.jit
+    def measured(means, S, values):
+        expected = expectation(means, jnp.zeros((3, 3))).replace(covariance=S)
+        return MEASURES[name](expected, Detections.from_values(values), PARAMS)
+
+    alone = [
+        [measured(means[i : i + 1], S[i : i + 1], values[j : j + 1])[0, 0] for j in range(3)] for i in (0, 1)
+    ]
+    np.testing.assert_allclose(measured(means, S, values), alone, rtol=1e-12)
+    behind = [np.asarray(wrap_detection(each + np.array([0, np.pi, 0]))) for each in (means, values)]
+    assert np.ptp(behind[1][:, 1]) > 6
+    np.testing.assert_allclose(measured(behind[0], S, behind[1]), alone, rtol=1e-9)
 
 
 def test_every_measure_can_be_asked_for_by_name():

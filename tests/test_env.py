@@ -1,14 +1,19 @@
 """The environment's contract: six values, autoreset, truncation, determinism, one compilation."""
 
+from types import SimpleNamespace
+
 import chex
 import gymnax
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy import stats
 
 import jaxtrack
-from jaxtrack import Params, SearchTrack, StaticParams, make, metrics
+from jaxtrack import Params, SearchTrack, StaticParams, Tracks, make, metrics
+from jaxtrack.association import euclidean
+from jaxtrack.env import step_info
 from jaxtrack.observation import observe
 from jaxtrack.params import METRICS
 
@@ -214,14 +219,49 @@ def test_recorded_truths_of_a_wrong_shape_are_refused(env):
         env.reset(jax.random.key(0), params)
 
 
-@pytest.mark.usefixtures("quick_compilation")
-def test_metrics_can_be_asked_for_in_info():
-    env, params = make(**SHAPES, info_metrics=("gospa", "gospa_missed"))
-    _, state = env.reset(jax.random.key(0), params)
-    _, state, _, _, _, info = env.step(jax.random.key(1), state, jnp.array([2, 2]), params)
-    found = metrics.gospa(state.truths, state.tracks, params)
-    assert float(info["gospa"]) == pytest.approx(float(found.distance))
-    assert float(info["gospa_missed"]) == pytest.approx(float(found.missed))
+@pytest.fixture(scope="module")
+def choices(quick_compilation):
+    """Three steps of an environment with births, another measure, and more metrics in `info`."""
+    shapes = {"info_metrics": ("gospa", "gospa_missed"), "measure": "euclidean"}
+    wide = PARAMS.replace(birth_rate=2.0, initial_truths=2, beam_azimuth=3.0, beam_elevation=3.0)
+    env, params = make(wide, **SHAPES, **shapes)
+
+    @jax.jit
+    def play(key, params):
+        def advance(state, key):
+            noise = env.sample_noise(key)
+            # P(at most 1) = 0.41 and P(at most 2) = 0.68 at rate 2.
+            noise = noise.replace(truths=noise.truths.replace(birth_count=jnp.asarray(0.5)))
+            state, record = env.advance(state, jnp.array([1, 2]), noise, params)
+            info = step_info(state, record, (0.0, 0.0), env.static, params)
+            measured = euclidean(record.tracker.expected, record.detections, params)
+            return state, (state, record, info, measured)
+
+        _, state = env.reset_env(key, params)
+        return jax.lax.scan(advance, state, jax.random.split(key, 3))[1]
+
+    return play(jax.random.key(0), params)
+
+
+def test_metrics_can_be_asked_for_in_info(choices):
+    state, _, info, _ = choices
+    found = jax.jit(jax.vmap(metrics.gospa, in_axes=(0, 0, None)))(state.truths, state.tracks, PARAMS)
+    np.testing.assert_allclose(info["gospa"], found.distance, rtol=1e-5)
+    np.testing.assert_allclose(info["gospa_missed"], found.missed, rtol=1e-5)
+
+
+def test_births_without_a_row_are_counted_step_by_step(choices):
+    state, _, info, _ = choices
+    np.testing.assert_array_equal(state.num_born, [4, 6, 8])
+    # The first takes the third of three rows, then nothing is left.
+    np.testing.assert_array_equal(info["dropped_truths"], [1, 2, 2])
+
+
+def test_the_measure_is_the_one_asked_for(choices):
+    _, record, _, measured = choices
+    pairs = record.tracker.predicted.active[..., None] & record.detections.active[:, None]
+    assert bool(pairs.any())
+    np.testing.assert_allclose(record.tracker.distances[pairs], measured[pairs], rtol=1e-5)
 
 
 @pytest.mark.usefixtures("quick_compilation")
@@ -234,6 +274,23 @@ def test_a_metric_can_stop_an_episode(threshold, terminated):
     assert bool(ended) is terminated
     assert not bool(truncated)
     assert int(state.time) == (0 if terminated else 1)
+
+
+def test_a_metric_at_its_threshold_does_not_stop_an_episode(env):
+    stopping = SearchTrack(env.static, stop_metric="covariance_norm_sum")
+    nothing_tracked = SimpleNamespace(truths=None, tracks=Tracks.empty(1))
+    for threshold, terminated in ((0.0, False), (-1e-6, True), (None, False)):
+        params = PARAMS.replace(stop_threshold=threshold)
+        assert bool(stopping.is_terminated(nothing_tracked, params)) is terminated
+
+
+def test_nothing_random_serves_twice(env):
+    noise = jax.jit(env.sample_noise)(jax.random.key(2))
+    normal = np.concatenate([noise.truths.motion.ravel(), noise.sensor.detection.ravel()])
+    uniform = [noise.truths.death, noise.truths.birth_count, noise.sensor.detected]
+    uniform += [noise.sensor.clutter_count, noise.sensor.clutter]
+    levels = np.concatenate([stats.norm.cdf(normal), *(np.ravel(draw) for draw in uniform)])
+    assert np.diff(np.sort(levels)).min() > 1e-5
 
 
 @pytest.mark.parametrize(
@@ -249,5 +306,28 @@ def test_metrics_that_do_not_exist_are_refused(fields, message):
         make(**fields)
 
 
-def test_every_name_of_a_metric_has_its_function():
+@pytest.mark.usefixtures("quick_compilation")
+def test_every_name_of_a_metric_has_its_function(truths_at, tracks_at):
     assert set(METRICS) == set(metrics.METRICS)
+    truths = truths_at([[1000, 0, 0], [3000, 0, 0], [5000, 0, 0]])
+    tracks = tracks_at([[1010, 0, 0, 0, 0, 0], [9000, 0, 0, 0, 0, 0]], 4)
+    found, parts = jax.jit(
+        lambda: (
+            {name: metric(truths, tracks, PARAMS) for name, metric in metrics.METRICS.items()},
+            metrics.gospa(truths, tracks, PARAMS),
+        )
+    )()
+    norm = float(np.linalg.norm(tracks.covariance[0]))
+    expected = {
+        "gospa": parts.distance,
+        "gospa_localisation": parts.localisation,
+        "gospa_missed": parts.missed,
+        "gospa_false": parts.false,
+        "completeness": 1 / 3,
+        "uncertainty_per_truth": (norm + 2 * PARAMS.deletion_threshold) / 3,
+        "covariance_norm_sum": 2 * norm,
+        "covariance_norm_mean": norm,
+    }
+    assert len({round(float(value), 3) for value in expected.values()}) == len(expected)
+    for name, value in expected.items():
+        np.testing.assert_allclose(found[name], value, rtol=1e-5, err_msg=name)

@@ -21,6 +21,12 @@ def test_a_platform_that_looks_north_sees_the_east_on_its_right():
     np.testing.assert_allclose(seen, [0, 0, -1000, -5, 10, 0], atol=1e-3)
 
 
+def test_a_platform_rolled_by_a_right_angle_has_the_sky_on_its_left():
+    turned = rotation(jnp.array([np.pi / 2, 0.0, 0.0]))
+    np.testing.assert_allclose(turned @ jnp.array([0.0, 0.0, 1.0]), [0, 1, 0], atol=1e-6)
+    np.testing.assert_allclose(turned @ jnp.array([1.0, 2.0, 0.0]), [1, 0, -2], atol=1e-6)
+
+
 def test_there_and_back(x64):
     states = jax.random.normal(jax.random.key(0), (4, 5, 6))
     place, orientation = jnp.array([3.0, -2.0, 1.0]), jnp.array([0.3, -0.8, 2.0])

@@ -1,5 +1,6 @@
 """Reward terms by hand arithmetic."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -96,9 +97,12 @@ def test_gospa_is_worth_one_for_perfect_tracks_and_nothing_without_any():
     state = jnp.zeros((4, 6)).at[:, 0].set(jnp.array([1000.0, 3000.0, 5000.0, 7000.0]))
     truths = Truths(state=state, alive=jnp.array([True, True, False, False]))
 
-    def worth(means, active):
-        after = track_list([1.0] * 4, [NONE] * 4, active=active).replace(mean=means)
-        return float(accuracy(after, after, truths, STATIC, params))
+    nothing = track_list([1.0] * 4, [NONE] * 4, active=[False] * 4)
+    worth_of = jax.jit(accuracy, static_argnums=3)
+
+    def worth(means, active, truths=truths, params=params):
+        after = nothing.replace(mean=means, active=jnp.array(active))
+        return float(worth_of(nothing, after, truths, STATIC, params))
 
     assert worth(state, [True, True, False, False]) == pytest.approx(1.0)
     assert worth(state, [False] * 4) == pytest.approx(0.0)
@@ -106,6 +110,11 @@ def test_gospa_is_worth_one_for_perfect_tracks_and_nothing_without_any():
     assert worth(state, [True, False, False, False]) == pytest.approx(1 - np.sqrt(0.5))
     # Four tracks, two of them false, none on a truth: sqrt(6/2) against sqrt(2/2).
     assert worth(state + 500, [True] * 4) == pytest.approx(1 - np.sqrt(3.0))
+    # Of the first order it is the share of truths missed; without truths or tracks nothing is wrong.
+    first_order = params.replace(gospa_order=1.0)
+    all_alive = truths.replace(alive=jnp.ones(4, dtype=bool))
+    assert worth(state, [True] + [False] * 3, all_alive, first_order) == pytest.approx(0.25)
+    assert worth(state, [False] * 4, truths.replace(alive=jnp.zeros(4, dtype=bool))) == 1.0
 
 
 def test_every_name_of_a_reward_has_its_function():

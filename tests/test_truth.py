@@ -136,14 +136,16 @@ def test_deaths_come_before_and_births_after_motion():
     state = jnp.zeros((4, 6)).at[:, 0].set(2000.0).at[:, 1].set(10.0)
     truths = Truths(state=state, alive=jnp.arange(4) < 2)
     # P(0 births) = 0.37 and P(at most 1) = 0.74 at rate 1.
-    noise = draws(4, death=jnp.array([0.1, 0.2, 0.0, 0.0]), birth_count=0.5)
+    # The newborn has a velocity, with which it must not have moved yet.
+    motion = jnp.zeros((4, 3, 2)).at[2, :, 1].set(1.0)
+    noise = draws(4, motion, death=jnp.array([0.1, 0.2, 0.0, 0.0]), birth_count=0.5)
     after, num_born = propagate(truths, jnp.asarray(2), noise, 1, params)
     np.testing.assert_array_equal(after.alive, [False, True, True, False])
     assert int(num_born) == 3
     assert float(after.state[1, 0]) == 2010.0
-    # Draws of zero are the middle of the field at rest.
-    middle = (params.min_range + params.max_range) / 2
-    np.testing.assert_allclose(after.state[2], [middle, 0, 0, 0, 0, 0], atol=1e-3)
+    # Draws of zero are the middle of the field.
+    middle, speed = (params.min_range + params.max_range) / 2, params.truth_velocity_sigma
+    np.testing.assert_allclose(after.state[2], [middle, speed, 0, speed, 0, speed], atol=1e-3)
 
 
 def test_the_row_of_a_dead_truth_is_not_used_again():
@@ -152,6 +154,20 @@ def test_the_row_of_a_dead_truth_is_not_used_again():
     after, num_born = propagate(truths, jnp.asarray(3), draws(3, birth_count=0.9), 1, params)
     np.testing.assert_array_equal(after.alive, truths.alive)
     assert int(num_born) == 5  # two births that found no row
+
+
+def test_more_births_than_rows_are_all_counted():
+    crowd, nobody = Params(birth_rate=6.0), Truths(state=jnp.zeros((3, 6)), alive=jnp.zeros(3, dtype=bool))
+    after, num_born = propagate(nobody, jnp.asarray(1), draws(3, birth_count=0.9), 1, crowd)
+    np.testing.assert_array_equal(after.alive, [False, True, True])
+    assert int(num_born) == 1 + 9  # P(at most 8) = 0.85 and P(at most 9) = 0.92 at rate 6
+
+
+def test_no_draw_serves_twice():
+    noise = sample_truth_noise(*jax.random.split(jax.random.key(0)), 50)
+    uniform = np.append(noise.death, noise.birth_count)
+    assert len(np.unique(uniform)) == 51
+    assert len(np.unique(noise.motion)) == 300
 
 
 def test_births_and_deaths_are_as_frequent_as_asked():

@@ -2,15 +2,17 @@
 
 import dataclasses
 import json
+from types import SimpleNamespace
 
 import jax
 import numpy as np
 import pytest
 
+from jaxtrack import Params
 from reference.parity import __main__ as command
-from reference.parity import oracle, ours
+from reference.parity import free_running, oracle, ours, stepwise
 from reference.parity.compare import TOLERANCE, exact_mahalanobis
-from reference.parity.episodes import EpisodeTallies, compare_episode
+from reference.parity.episodes import Comparison, Divergence, EpisodeTallies, compare_episode, is_tied
 from reference.parity.rows import Row, Tally
 from reference.parity.scenarios import KINDS, random_scenario
 from reference.parity.table import BEGIN, END, cells, write_readme
@@ -53,6 +55,10 @@ def test_the_quick_run(tmp_path, capsys):
     assert code == 0, capsys.readouterr().out
     assert found["divergences"] == []
     assert all(row["passed"] for row in found["rows"])
+    # What is said to be in single precision, or by finite differences, is.
+    for row in found["rows"]:
+        assert row["float32"] is None or row["float32"] > 1e-9, row
+        assert row["stock"] is None or row["stock"] > 1e-9, row
     table = readme.read_text()
     assert table.startswith("before\n")
     assert table.endswith("after\n")
@@ -133,6 +139,168 @@ def test_a_different_decision_is_named(played, kind, quantity):
     assert (divergence.step, divergence.track, divergence.quantity) == (step + 1, key, quantity)
     assert divergence.ours != divergence.theirs
     assert f"step {step + 1}, track born on step {key[0]} from {key[1]}: {quantity}" in str(divergence)
+
+
+@pytest.mark.parametrize(
+    ("kind", "quantity"),
+    [("associated", "associated detection"), ("deleted", "deleted"), ("initiated", "initiated")],
+)
+def test_a_decision_that_only_stone_soup_takes_is_named(played, kind, quantity):
+    scenario, records, tracks, info = played
+    spared = ((k, sorted(r.updated.keys() - r.associated.keys() - r.deleted)) for k, r in enumerate(records))
+    step, key = next((k, keys[0]) for k, keys in spared if keys)
+    more = (
+        {**records[step].associated, key: 0} if kind == "associated" else getattr(records[step], kind) | {key}
+    )
+    records = changed(records, step, **{kind: more})
+    divergence = compare_episode(
+        records, tracks, info, scenario.detections.active, scenario.params, TOLERANCE
+    ).divergence
+    assert (divergence.step, divergence.track, divergence.quantity) == (step + 1, key, quantity)
+
+
+def test_an_estimate_that_is_not_a_number_diverges(played):
+    scenario, records, tracks, info = played
+    step, key = first(records, "live")
+    nan = dataclasses.replace(records[step].live[key], mean=np.full(6, np.nan))
+    records = changed(records, step, live={**records[step].live, key: nan})
+    found = compare_episode(records, tracks, info, scenario.detections.active, scenario.params, TOLERANCE)
+    assert (found.divergence.step, found.divergence.track) == (step + 1, key)
+
+
+@pytest.mark.parametrize("newborn", [True, False])
+def test_errors_of_newborns_are_kept_apart(played, newborn):
+    scenario, records, tracks, info = played
+    lists = ((k, sorted(r.initiated if newborn else r.associated)) for k, r in enumerate(records))
+    step, key = next((k, keys[0]) for k, keys in lists if keys)
+    estimate = records[step].live[key]
+    off = dataclasses.replace(estimate, covariance=estimate.covariance * (1 + 1e-6))
+    records = changed(records, step, live={**records[step].live, key: off})
+    found = compare_episode(records, tracks, info, scenario.detections.active, scenario.params, 1e-3)
+    assert found.divergence is None
+    assert found.error > 1e-7
+    assert (found.birth_error > 1e-7) is newborn
+
+
+@pytest.mark.parametrize(
+    ("distances", "tied"),
+    [
+        pytest.param([[1, 1], [2, 9]], True, id="two detections for one track"),
+        pytest.param([[1, 2], [1, 9]], True, id="two tracks for one detection"),
+        pytest.param([[1, 2], [9, 1 + 1e-9]], False, id="nearly"),
+        pytest.param([[1, 9], [9, 1]], False, id="equal, but of other tracks and detections"),
+        pytest.param([[4, 4], [9, 9]], False, id="beyond the missed distance"),
+        pytest.param([[np.nan, np.nan], [1, 2]], False, id="no distances"),
+    ],
+)
+def test_ties_are_equal_distances_of_pairs_that_compete(distances, tied):
+    params = Params(gate_threshold=5.0, missed_distance=3.0)
+    # A third track and a third detection that do not exist are as near as can be.
+    table = np.zeros((3, 3))
+    table[:2, :2] = distances
+    there = np.array([True, True, False])
+    info = SimpleNamespace(distances=table, predicted=SimpleNamespace(active=there))
+    assert is_tied(info, there, params) is tied
+
+
+def test_a_divergence_is_a_decision_that_disagrees():
+    tallies = EpisodeTallies()
+    assert np.isnan(tallies.agreement)
+    tallies.add(3, Comparison(steps=5, updates=1, births=2))
+    assert tallies.agreement == 1
+    tallies.add(4, Comparison(steps=2, divergence=Divergence(3, None, "live", True, False)))
+    assert tallies.agreement == 3 / 4
+    assert [number for number, _ in tallies.divergences] == [4]
+
+
+def test_every_variant_of_an_episode_has_its_own_figures(monkeypatch):
+    """Ours in both precisions against the exact oracle, in double precision against the bare one."""
+    variants = {(True, True): 1, (True, False): 2, (False, True): 3}
+
+    def compare(_, exact_jacobian, is_double, tolerance):
+        assert (tolerance == TOLERANCE) is (exact_jacobian and is_double)
+        size = variants[exact_jacobian, is_double]
+        divergence = Divergence(1, None, "x", 0, 1)
+        return SimpleNamespace(
+            steps=5, decisions=size, error=size, birth_error=10 * size, tie=False, divergence=divergence
+        )
+
+    monkeypatch.setattr(free_running, "run_all", lambda jobs, _: [job.exact_jacobian for job in jobs])
+    monkeypatch.setattr(free_running, "compare", compare)
+    rows, lines = free_running.free_running_rows(range(2), 1, 1, lambda items, *_: items)
+    assert [(row.float64, row.float32, row.stock) for row in rows] == [(10, 20, 30), (1, 2, 3)]
+    agreements = rows[1].agreement, rows[1].agreement32, rows[1].agreement_stock
+    assert agreements == (1 / 2, 2 / 3, 3 / 4)
+    assert [row.compared for row in rows] == [10, 10]
+    kinds = ("", " (float32)", " (stock initiator)")
+    assert lines == [f"episode {n}{kind}: step 1: x ours 0, Stone Soup 1" for kind in kinds for n in (0, 1)]
+
+
+@pytest.fixture(scope="module")
+def stepped(played):
+    """The first steps of the scenario, with the oracle's intermediates."""
+    scenario, *_ = played
+    short = dataclasses.replace(
+        scenario, detections=jax.tree.map(lambda leaf: leaf[:STEPWISE], scenario.detections)
+    )
+    records = oracle.run(oracle.Job(short, intermediates=True))
+    return short, records, oracle.tracks_before(records, ours.MAX_TRACKS)
+
+
+STEPWISE = 15
+
+
+def flagged(scenario, records, before):
+    """Components that do not pass."""
+    tallies = stepwise.Tallies(Tally)
+    stepwise.compare_steps(scenario, records, before, True, tallies)
+    tolerance = {key: stepwise.EXCEPTIONS.get(key, (TOLERANCE, ""))[0] for key in stepwise.COMPONENTS}
+    rows = {key: tallies[key].row(key, "", "", tolerance=tolerance[key]) for key in tolerance}
+    return {key for key, row in rows.items() if not row.passed}
+
+
+def slightly(value):
+    return value * (1 + 1e-5)
+
+
+@pytest.mark.parametrize(
+    ("kind", "change", "components"),
+    [
+        pytest.param("expected", {}, set(), id="nothing"),
+        pytest.param("expected", {"mean": slightly}, {"predict"}, id="predicted mean"),
+        pytest.param("expected", {"covariance": slightly}, {"predict"}, id="predicted covariance"),
+        pytest.param(
+            "expected", {"detection_mean": slightly}, {"expect", "measure"}, id="expected detection"
+        ),
+        pytest.param("expected", {"detection_covariance": slightly}, {"expect", "measure"}, id="S"),
+        pytest.param("expected", {"cross_covariance": slightly}, {"expect"}, id="cross covariance"),
+        pytest.param("expected", {"distances": slightly}, {"pinv"}, id="distances"),
+        pytest.param("expected", {"admissible": np.logical_not}, {"gate"}, id="gate"),
+        pytest.param("updated", {"mean": slightly}, {"update"}, id="updated mean"),
+        pytest.param("updated", {"covariance": slightly}, {"update"}, id="updated covariance"),
+        pytest.param("live", {"mean": slightly}, {"initiate", "step"}, id="mean at the end"),
+        pytest.param("live", {"covariance": slightly}, {"initiate", "step"}, id="covariance at the end"),
+        pytest.param("associated", None, {"associate", "update", "step"}, id="associations"),
+        pytest.param("deleted", None, {"delete", "step"}, id="deletions"),
+        pytest.param("initiated", None, {"initiate"}, id="births"),
+    ],
+)
+def test_every_intermediate_is_compared(stepped, kind, change, components):
+    scenario, records, before = stepped
+
+    def wrong(record):
+        entries = getattr(record, kind)
+        if change is None:
+            return dataclasses.replace(record, **{kind: type(entries)()})
+        other = {
+            key: dataclasses.replace(
+                entry, **{name: off(getattr(entry, name)) for name, off in change.items()}
+            )
+            for key, entry in entries.items()
+        }
+        return dataclasses.replace(record, **{kind: other})
+
+    assert flagged(scenario, [wrong(record) for record in records], before) == components
 
 
 @pytest.mark.parametrize("quantity", ["mean", "covariance"])

@@ -1,13 +1,22 @@
 """The Stone Soup environment, and its observation against `jaxtrack.observation` and `scan_map`."""
 
+import itertools
+
 import jax
 import numpy as np
 import pytest
+from stonesoup.types.groundtruth import GroundTruthState
 
 from jaxtrack import Params, StaticParams, observation, scan_map
 from jaxtrack.sensor import look_angles
+from reference import observation as observation_module
+from reference.components import EPOCH
+from reference.observation import TrackSlots
+from reference.radar import build_radar
+from reference.reward import track_term
 from reference.simulation import StoneSoupScenario
 from reference.translate import as_vector, to_tracks, track_key
+from reference.truths import initial_states, num_initial, truth_simulator
 
 STATIC = StaticParams(num_truths=6, max_tracks=9, map_size=24)
 UPDATE_MAP = jax.jit(scan_map.update_scan_map, static_argnums=2)
@@ -84,6 +93,70 @@ def test_episode_ends():
         scenario.step(0.0, 0.0)
     with pytest.raises(StopIteration):
         scenario.step(0.0, 0.0)
+
+
+def test_truths_start_in_the_field(params):
+    states = initial_states(np.random.default_rng(0), 4000, params)
+    azimuth, elevation, distance = cart2sphere_of(states)
+    for angle in (azimuth, elevation):
+        assert 0.99 * params.field_limit < np.abs(angle).max() <= params.field_limit
+        np.testing.assert_allclose(angle.std(), params.field_limit / np.sqrt(3), rtol=0.05)
+    assert params.min_range <= distance.min() < 1.02 * params.min_range
+    assert 0.99 * params.max_range < distance.max() <= params.max_range
+    np.testing.assert_allclose(states[:, 1::2].std(axis=0), params.truth_velocity_sigma, rtol=0.05)
+
+
+def cart2sphere_of(states):
+    x, y, z = states[:, 0::2].T
+    return np.arctan2(y, x), np.arctan2(z, np.hypot(x, y)), np.sqrt(x**2 + y**2 + z**2)
+
+
+def test_truths_of_its_own_are_born_die_and_move_as_asked():
+    numbers = {"initial_truths": 2, "process_noise": 1e9, "time_step": 1.0}
+    assert num_initial(STATIC, Params(**numbers)) == 2
+    assert num_initial(STATIC, Params()) == STATIC.num_truths
+    state = np.array([[3000.0, 10, 0, -5, 0, 0]])
+
+    def after(steps, **more):
+        params = Params(**numbers, truth_process_noise=0.0, **more)
+        for _, paths in itertools.islice(truth_simulator(state, 7, params), steps + 1):
+            living = list(paths)
+        return living
+
+    (straight,) = after(3)
+    np.testing.assert_allclose(as_vector(straight[-1].state_vector), [3030.0, 10, -15, -5, 0, 0])
+    assert 10 < len(after(10, birth_rate=2.0)) < 40
+    assert after(10, death_probability=1.0) == []
+
+
+def test_the_noise_of_the_radar_follows_its_seed(params):
+    truth = GroundTruthState(np.array([3000.0, 0, 0, 0, 0, 0]), timestamp=EPOCH)
+    values = [
+        as_vector(found.state_vector)
+        for seed in (1, 1, 2)
+        for found in build_radar(params, seed=seed).measure({truth})
+    ]
+    np.testing.assert_array_equal(values[0], values[1])
+    assert np.all(values[0] != values[2])
+
+
+@pytest.mark.parametrize(("living", "worst"), [(0, 100.0), (2, 200.0), (8, 800.0)])
+def test_the_reward_of_that_name_is_gospa_beside_that_without_tracks(living, worst):
+    static, params = StaticParams(reward="gospa"), Params(gospa_order=1.0)
+    assert track_term({}, {}, 50.0, living, static, params) == pytest.approx(1 - 50.0 / worst)
+
+
+def test_a_track_without_a_slot_waits_for_the_first_free_one(monkeypatch):
+    monkeypatch.setattr(observation_module, "track_key", lambda track: track)
+    slots = TrackSlots(3)
+    for live, held in (
+        ({2, 1, 3, 4}, [1, 2, 3]),
+        ({1, 3, 4}, [1, 4, 3]),
+        ({3, 5}, [5, None, 3]),
+        ({3, 5, 7, 6, 8}, [5, 6, 3]),
+    ):
+        slots.update(live)
+        assert slots.tracks == held
 
 
 @pytest.mark.parametrize("numbers", [{"clutter_rate": 1.0}, {"detection_probability": 0.5}])

@@ -142,6 +142,8 @@ def test_missing_fields_keep_their_defaults():
     assert config.params == Params(time_step=0.05)
     # A whole number is a number.
     assert from_dict({"learning_rate": 1}).learning_rate == 1
+    # What is optional can be left open in words too.
+    assert from_dict({"params": {"stop_threshold": None}}).params == Params()
 
 
 @pytest.mark.parametrize(
@@ -152,6 +154,9 @@ def test_missing_fields_keep_their_defaults():
         ({"params": {"nonsense": 1}}, "params.nonsense: no such field; expected one of alpha, "),
         ({"num_envs": "8"}, "num_envs = '8': expected int"),
         ({"num_envs": 8.0}, "num_envs = 8.0: expected int"),
+        ({"num_envs": True}, "num_envs = True: expected int"),
+        ({"static": {"info_metrics": "gospa"}}, "static.info_metrics = 'gospa': expected list"),
+        ({"params": {"initial_truths": 2.0}}, "params.initial_truths = 2.0: expected int"),
         ({"learning_rate": True}, "learning_rate = True: expected float"),
         ({"learning_rate": "fast"}, "learning_rate = 'fast': expected float"),
         ({"anneal": "no"}, "anneal = 'no': expected bool"),

@@ -158,3 +158,17 @@ def test_without_a_whole_episode_the_return_is_nan():
     assert np.isnan(summary["episode_return"])
     ended = finished | {"terminated": jnp.array([[True]])}
     assert learner.summarise(ended, {}, Params(max_steps_in_episode=4))["episodes"] == 1
+
+
+def test_only_whole_episodes_count_for_the_return_and_all_steps_for_the_rest():
+    """Two steps of three environments: cut short, whole or stopped, and going on."""
+    finished = {
+        "done": jnp.array([[True, False, False], [True, True, False]]),
+        "terminated": jnp.array([[False, False, False], [True, False, False]]),
+        "episode_length": jnp.array([[3, 3, 1], [1, 4, 2]]),
+        "episode_return": jnp.array([[100.0, 200.0, 300.0], [2.0, 5.0, 400.0]]),
+    }
+    reward = jnp.array([[1.0, 2.0, 3.0], [4.0, 5.0, 9.0]])
+    summary = learner.summarise(finished, {"reward": reward}, Params(max_steps_in_episode=4))
+    assert (int(summary["episodes"]), float(summary["episode_return"])) == (2, 3.5)
+    assert summary["reward"] == 4
