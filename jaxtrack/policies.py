@@ -5,6 +5,8 @@ time into it. Rules read the track list, the scan map and the clock, never the t
 
     policy = POLICIES["index"](static, params)
     action = policy(key, state)
+
+Numbers of a rule are keywords of its builder: `partial(index, exponent=2.0)` is a builder too.
 """
 
 from collections.abc import Callable
@@ -73,8 +75,16 @@ def stalest(static: StaticParams, params: Params) -> Policy:
     return policy
 
 
-def scheduler(static: StaticParams, params: Params) -> Policy:
-    """Revisits the most uncertain track once it is urgent, else looks at the stalest cell."""
+def scheduler(
+    static: StaticParams, params: Params, *, revisit_share: float | jax.Array = REVISIT_SHARE
+) -> Policy:
+    """Revisits the most uncertain track once it is urgent, else looks at the stalest cell.
+
+    Args:
+        static: shapes.
+        params: numbers.
+        revisit_share: share of the deletion threshold from which a trace is urgent.
+    """
     weights = beam_weights(static, params)
 
     def policy(key: jax.Array, state: "EnvState") -> jax.Array:
@@ -83,17 +93,29 @@ def scheduler(static: StaticParams, params: Params) -> Policy:
         worst = jnp.argmax(share)
         towards_track = nearest_look(state.tracks.mean[worst], static, params)
         stalest_look = jnp.argmax(weights @ state.scan_map.ravel())
-        index = jnp.where(share[worst] > REVISIT_SHARE, towards_track, stalest_look)
+        index = jnp.where(share[worst] > revisit_share, towards_track, stalest_look)
         return to_action(index, static, params)
 
     return policy
 
 
-def index(static: StaticParams, params: Params) -> Policy:
+def index(
+    static: StaticParams,
+    params: Params,
+    *,
+    exponent: float | jax.Array = 1.0,
+    scan_weight: float | jax.Array = 1.0,
+) -> Policy:
     """The look with the largest index.
 
     The index of a look is the mean scan value in its beam plus, summed over the tracks in it,
     trace / deletion threshold.
+
+    Args:
+        static: shapes.
+        params: numbers.
+        exponent: power of each trace / deletion threshold.
+        scan_weight: weight of the mean scan value.
     """
     weights = beam_weights(static, params)
     looks = look_grid(static, params)
@@ -101,7 +123,8 @@ def index(static: StaticParams, params: Params) -> Policy:
     def policy(key: jax.Array, state: "EnvState") -> jax.Array:
         del key
         inside = tracks_in_beams(state.tracks, looks, params)
-        value = weights @ state.scan_map.ravel() + inside @ trace_share(state.tracks, params)
+        urgency = inside @ trace_share(state.tracks, params) ** exponent
+        value = scan_weight * (weights @ state.scan_map.ravel()) + urgency
         return to_action(jnp.argmax(value), static, params)
 
     return policy

@@ -9,7 +9,7 @@ import pytest
 
 from jaxtrack import Params, StaticParams, Tracks, Truths
 from jaxtrack.env import EnvState, SearchTrack
-from jaxtrack.policies import POLICIES, REVISIT_SHARE
+from jaxtrack.policies import POLICIES, REVISIT_SHARE, index, scheduler
 from jaxtrack.sensor import look_angles
 
 pytestmark = pytest.mark.usefixtures("quick_compilation")
@@ -64,8 +64,8 @@ def inside(points, azimuth, elevation):
     return bearing & (np.abs(np.arctan2(z, np.hypot(x, y))) <= PARAMS.beam_elevation / 2)
 
 
-def by_look(state):
-    """Mean scan value and, summed over tracks, trace per threshold: `[L, L]` each, in numpy."""
+def by_look(state, exponent=1.0):
+    """Mean scan value and, summed over tracks, powers of trace per threshold: `[L, L]` each, in numpy."""
     angles = np.linspace(-LIMIT, LIMIT, M)
     pixels = unit(*np.meshgrid(angles, angles)).reshape(-1, 3)
     values = np.asarray(state.scan_map, dtype=np.float64).ravel()
@@ -76,7 +76,7 @@ def by_look(state):
     for i, azimuth in enumerate(np.linspace(-LIMIT, LIMIT, L)):
         for j, elevation in enumerate(np.linspace(-LIMIT, LIMIT, L)):
             scan[i, j] = values[inside(pixels, azimuth, elevation)].mean()
-            share[i, j] = shares[active & inside(tracks, azimuth, elevation)].sum()
+            share[i, j] = (shares[active & inside(tracks, azimuth, elevation)] ** exponent).sum()
     return scan, share
 
 
@@ -176,6 +176,19 @@ def test_index_weighs_both_terms():
     assert [act("index", state) for state in states] == chosen
 
 
+@pytest.mark.parametrize(("exponent", "scan_weight"), [(0.3, 1.0), (1.0, 5.0), (3.0, 0.5)])
+def test_index_with_other_numbers(exponent, scan_weight):
+    build = functools.partial(index, exponent=exponent, scan_weight=scan_weight)
+    moved = 0
+    for seed in range(8):
+        state = scene(seed)
+        scan, share = by_look(state, exponent)
+        action = build(STATIC, PARAMS)(jax.random.key(0), state).tolist()
+        assert action == largest(scan_weight * scan + share)
+        moved += action != act("index", state)
+    assert moved > 0, "in these scenes the numbers matter"
+
+
 def with_share(share, azimuth, elevation):
     """One live track of that trace per threshold; a dead slot holds a worse one elsewhere."""
     state = scene(0)
@@ -202,6 +215,15 @@ def test_scheduler_revisits_an_urgent_track_and_else_the_stalest_cell(place):
     assert stalest != list(place)
     assert act("scheduler", urgent) == list(place)
     assert act("scheduler", patient) == stalest
+
+
+def test_scheduler_with_another_share():
+    place = (3, 1)
+    grid = np.linspace(-LIMIT, LIMIT, L)
+    policy = functools.partial(scheduler, revisit_share=0.3)(STATIC, PARAMS)
+    for share, revisits in ((0.31, True), (0.29, False)):
+        state = with_share(share, grid[place[0]], grid[place[1]])
+        assert (policy(jax.random.key(0), state).tolist() == list(place)) == revisits
 
 
 def test_scheduler_turns_to_the_worst_of_several_tracks():
