@@ -333,6 +333,12 @@ def test_exact_ties_end_a_comparison_and_are_counted(played):
     tallies = EpisodeTallies()
     tallies.add(0, found)
     assert tallies.ties == 1
+    # What differed before the tie is not excused by it.
+    step, _ = first(records, "initiated")
+    wrong = changed(records, step, initiated=set())
+    found = compare_episode(wrong, *ours.episode(twice), twice.detections.active, twice.params, TOLERANCE)
+    assert found.divergence.quantity == "initiated"
+    assert not found.tie
 
 
 def test_oracles_in_processes_give_the_same(played):
