@@ -60,8 +60,8 @@ def learning_curve(metrics_csv_path: str | Path, out_png: str | Path) -> None:
     if "env_steps" not in columns or not shown:
         expected = ", ".join(["env_steps", *CURVES])
         raise ValueError(f"{metrics_csv_path}: columns {', '.join(columns)}; expected {expected}")
-    figure, panels = _panels(len(shown), height=2.9)
-    for axes, name in zip(panels, shown, strict=True):
+    figure, places = panels(len(shown), height=2.9)
+    for axes, name in zip(places, shown, strict=True):
         drawn = np.isfinite(columns["env_steps"]) & np.isfinite(columns[name])
         steps, values = columns["env_steps"][drawn] / 1e6, columns[name][drawn]
         axes.plot(steps, values, color=COLOUR, lw=1.5, marker="." if len(steps) < 2 else None)
@@ -69,7 +69,7 @@ def learning_curve(metrics_csv_path: str | Path, out_png: str | Path) -> None:
         axes.set_xlabel("environment steps (millions)", fontsize=9)
         axes.grid(color="0.92")
     if "completeness" in shown:
-        panels[shown.index("completeness")].set_ylim(0, 1.02)
+        places[shown.index("completeness")].set_ylim(0, 1.02)
     figure.savefig(out_png)
 
 
@@ -91,12 +91,12 @@ def comparison(table: Mapping[str, Mapping[str, Interval]], out_png: str | Path)
         missing = [name for name in shown if name not in metrics]
         if missing:
             raise ValueError(f"table[{policy!r}] lacks {', '.join(missing)}")
-    figure, panels = _panels(len(shown), height=1.1 + 0.28 * len(table))
-    for axes, name in zip(panels, shown, strict=True):
+    figure, places = panels(len(shown), height=1.1 + 0.28 * len(table))
+    for axes, name in zip(places, shown, strict=True):
         _dots_and_intervals(axes, [metrics[name] for metrics in table.values()])
         label, direction = COMPARED[name]
         axes.set_title(f"{label}\n{direction}", fontsize=9.5)
-        axes.set_yticks(range(len(table)), list(table) if axes is panels[0] else [])
+        axes.set_yticks(range(len(table)), list(table) if axes is places[0] else [])
         axes.set_ylim(len(table) - 0.5, -0.5)
     figure.savefig(out_png)
 
@@ -113,15 +113,29 @@ def _dots_and_intervals(axes: "Axes", intervals: list[Interval]) -> None:
     axes.set_xlim(0, 1.06 * max(np.nanmax(high), np.finfo(float).tiny))
 
 
-def _panels(number: int, height: float) -> tuple["Figure", list["Axes"]]:
+def panels(
+    number: int, height: float, columns: int | None = None, width: float = 2.8
+) -> tuple["Figure", list["Axes"]]:
+    """A figure with that many panels.
+
+    Args:
+        number: of panels.
+        height: of a row of panels (inches).
+        columns: panels side by side; unset, all.
+        width: of a panel (inches).
+    """
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(2.8 * number, height), dpi=DPI, layout="constrained")
-    panels = list(figure.subplots(1, number, squeeze=False)[0])
-    for axes in panels:
+    columns = columns or number
+    rows = -(-number // columns)
+    figure = Figure(figsize=(width * columns, height * rows), dpi=DPI, layout="constrained")
+    places = list(figure.subplots(rows, columns, squeeze=False).ravel())
+    for axes in places:
         axes.spines[["top", "right"]].set_visible(False)
         axes.tick_params(labelsize=8.5)
-    return figure, panels
+    for axes in places[number:]:
+        axes.set_visible(False)
+    return figure, places[:number]
 
 
 def _number(cell: str | None) -> float:

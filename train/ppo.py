@@ -22,8 +22,9 @@ from train import learner
 from train.agents import agent_policy
 from train.checkpoint import open_manager, save, write_config
 from train.config import TrainConfig, check, from_dict, to_dict
-from train.evaluate import COMPARED_SEED, compare_with_baselines, print_results, summarise, write_results
+from train.evaluate import COMPARED_SEED, agent, compare_with_baselines
 from train.learner import LearnerState
+from train.results import print_results, summarise, write_results
 
 FAILED = 1
 LOST = "training diverged: {name} is {value} after update {update}"
@@ -193,22 +194,24 @@ def finish(
     """Evaluates the trained agent against the baselines; writes tables and pictures."""
     from jaxtrack.recording import record_episode
     from jaxtrack.render import animate
-    from train import plots
+    from train import figures, plots
 
     started = time.perf_counter()
-    policy = agent_policy(config.encoder, state.weights)
-    results = compare_with_baselines(
-        config.encoder, policy, env, config.params, config.evaluation_episodes, COMPARED_SEED, console
+    competitor = agent(config.encoder, [state.weights], (config.seed,))
+    comparison = compare_with_baselines(
+        config.encoder, competitor, env, config.params, config.evaluation_episodes, COMPARED_SEED, console
     )
-    print_results(results, config.encoder, console)
-    write_results(results, folder)
+    summary = summarise(comparison.played)
+    print_results(comparison, summary, [config.encoder], console)
+    write_results(comparison, summary, env, config.params, COMPARED_SEED, folder)
     console.print(f"evaluated in {time.perf_counter() - started:.1f} s")
     plots.learning_curve(folder / "metrics.csv", folder / "learning_curve.png")
-    plots.comparison(summarise(results), folder / "comparison.png")
-    built = policy(env.static, config.params)
+    drawn = figures.draw_all(comparison.played, summary, config.params, folder)
+    built = agent_policy(config.encoder, state.weights)(env.static, config.params)
     episode = record_episode(env, config.params, built, jax.random.key(COMPARED_SEED))
     animate(episode, folder / "episode.gif", progress=console.is_terminal)
-    console.print(f"results.json, episodes.csv, learning_curve.png, comparison.png, episode.gif in {folder}")
+    pictures = ["learning_curve.png", *(path.name for path in drawn.values()), "episode.gif"]
+    console.print(f"results.json, episodes.csv, curves.npz, {', '.join(pictures)} in {folder}")
 
 
 def _columns() -> tuple[Any, ...]:

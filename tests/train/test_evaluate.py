@@ -1,142 +1,163 @@
-"""Comparison of policies on the same scenarios, its statistics and its files."""
+"""The command `python -m train.evaluate`: what it takes, what it refuses, what it leaves."""
 
 import csv
+import dataclasses
 import json
+from pathlib import Path
 
-import jax
 import numpy as np
 import pytest
-from rich.console import Console
 
-from jaxtrack import Params, StaticParams, metrics
-from jaxtrack.env import SearchTrack
-from jaxtrack.policies import POLICIES
+from jaxtrack import Params, StaticParams
+from jaxtrack.cli import run
+from tests.train.compared import THREE
 from train import evaluate
-from train.evaluate import METRICS, interval, paired_difference, print_results, write_results
+from train.config import TrainConfig
+from train.evaluate import COMPARED_SEED, baselines, check_shapes, group_runs
+from train.figures import FIGURES
+from train.scenarios import SCENARIOS, build_scenario
 
 pytestmark = pytest.mark.usefixtures("quick_compilation")
 
-STATIC = StaticParams(
-    num_truths=3, max_tracks=4, max_detections=3, max_clutter=0, map_size=8, num_looks=4, reward="information"
-)
-LENGTH = 12
-PARAMS = Params(max_steps_in_episode=LENGTH, time_step=0.05, beam_azimuth=0.9, beam_elevation=0.9)
-ENV = SearchTrack(STATIC)
+TINY = """
+max_steps_in_episode = 6
+beam_azimuth = 0.9
+[static]
+num_truths = 2
+max_tracks = 3
+max_detections = 2
+max_clutter = 0
+map_size = 6
+num_looks = 3
+"""
 
 
 @pytest.fixture(scope="module")
-def compared():
-    """Results of three entries, two of them the same policy, and how often progress was told."""
-    told = []
-    policies = {name: POLICIES[name.split("-")[0]] for name in ("index", "static", "index-again")}
-    results = evaluate.compare(policies, ENV, PARAMS, 5, 7, lambda: told.append(1))
-    return results, told
+def evaluated(tmp_path_factory):
+    """Folder after the whole command."""
+    folder = tmp_path_factory.mktemp("evaluated")
+    (folder / "tiny.toml").write_text(TINY)
+    options = ["--policies", "random", "static", "--episodes", "3", "--scenario", str(folder / "tiny.toml")]
+    page = folder / "pages" / "results.md"
+    assert evaluate.main([*options, "--out", str(folder / "out"), "--page", str(page)]) == 0
+    return folder
 
 
-def test_the_same_policy_meets_the_same_scenarios(compared):
-    results, told = compared
-    assert list(results) == ["index", "static", "index-again"]
-    assert len(told) == 3
-    for metric in METRICS:
-        assert results["index"][metric].shape == (5,)
-        np.testing.assert_array_equal(results["index"][metric], results["index-again"][metric])
-    assert (results["index"]["completeness"] > results["static"]["completeness"]).any()
-    # Scenarios differ from one another.
-    assert len(set(results["index"]["gospa"])) == 5
+def test_the_command_leaves_tables_curves_figures_and_a_page(evaluated):
+    out = evaluated / "out"
+    assert sorted(path.name for path in out.iterdir()) == sorted(
+        ["results.json", "episodes.csv", "curves.npz", *(f"{name}.png" for name in FIGURES)]
+    )
+    found = json.loads((out / "results.json").read_text())
+    assert list(found["policies"]) == ["random", "static"]
+    assert found["seed"] == COMPARED_SEED
+    assert found["scenario"]["params"]["beam_azimuth"] == 0.9
+    assert found["scenario"]["static"]["num_looks"] == 3
+    rows = list(csv.DictReader((out / "episodes.csv").read_text().splitlines()))
+    assert [row["policy"] for row in rows] == ["random"] * 3 + ["static"] * 3
+    mean = found["policies"]["random"]["metrics"]["gospa"]["mean"]["value"]
+    assert mean == pytest.approx(np.mean([float(row["gospa"]) for row in rows[:3]]), rel=1e-6)
+    page = (evaluated / "pages" / "results.md").read_text()
+    for name in FIGURES:
+        assert f"]({Path('..') / 'out' / f'{name}.png'})" in page
+    assert "python -m train.evaluate --policies random static --episodes 3" in page
 
 
-def test_metrics_are_those_of_the_episode_played_step_by_step(compared):
-    results, _ = compared
-    key_reset, key_noise, key_policy = jax.random.split(jax.random.split(jax.random.key(7), 5)[2], 3)
-    policy = POLICIES["index"](STATIC, PARAMS)
-
-    @jax.jit
-    def step(state, key):
-        action = policy(key_policy, state)
-        _, after, reward, _, _ = ENV.step_env(key, state, action, PARAMS)
-        distance = metrics.gospa(after.truths, after.tracks, PARAMS).distance
-        return after, (reward, distance, metrics.completeness(after.truths, after.tracks, PARAMS))
-
-    _, state = ENV.reset_env(key_reset, PARAMS)
-    steps = []
-    for key in jax.random.split(key_noise, LENGTH):
-        state, values = step(state, key)
-        steps.append(values)
-    reward, distance, completeness = np.array(steps).T
-    of_episode = {metric: values[2] for metric, values in results["index"].items()}
-    np.testing.assert_allclose(of_episode["episode_return"], reward.sum(), rtol=1e-4)
-    np.testing.assert_allclose(of_episode["gospa"], distance.mean(), rtol=1e-4)
-    np.testing.assert_allclose(of_episode["completeness"], completeness.mean(), rtol=1e-5)
-    np.testing.assert_allclose(of_episode["track_to_target_ratio"], int(state.num_initiated) / 3, rtol=1e-6)
-
-
-def test_an_interval_without_spread_is_its_mean():
-    assert interval(np.full(5, 3.0)) == (3.0, 3.0, 3.0)
-    assert interval(np.array([7.0])) == (7.0, 7.0, 7.0)
-
-
-def test_an_interval_is_about_two_standard_errors_wide():
-    values = np.random.default_rng(0).normal(10, 2, 400)
-    mean, low, high = interval(values)
-    assert mean == pytest.approx(values.mean())
-    half = 1.96 * values.std() / 20
-    assert low == pytest.approx(mean - half, abs=0.1 * half)
-    assert high == pytest.approx(mean + half, abs=0.1 * half)
-    assert interval(values) == (mean, low, high)
-
-
-# Own GOSPA against two others: 1 lower on every scenario, and better or worse by chance.
-RESULTS = {
-    "own": {metric: np.array([1.0, 2.0, 3.0, 6.0]) for metric in METRICS},
-    "plus-one": {metric: np.array([2.0, 3.0, 4.0, 7.0]) for metric in METRICS},
-    "other": {metric: np.array([6.0, 3.0, 2.0, 1.0]) for metric in METRICS},
-}
-
-
-def test_paired_differences_are_own_minus_other_scenario_by_scenario():
-    differences = paired_difference(RESULTS, "own")
-    assert set(differences) == {"plus-one", "other"}
-    # All four differ by the same: no uncertainty, although the values themselves spread.
-    assert differences["plus-one"] == (-1.0, -1.0, -1.0)
-    mean, low, high = differences["other"]
-    assert mean == 0.0
-    assert low < -2
-    assert high > 2
-
-
-def test_files_hold_means_intervals_and_every_episode(tmp_path):
-    write_results(RESULTS, tmp_path)
-    summary = json.loads((tmp_path / "results.json").read_text())
-    assert list(summary) == list(RESULTS)
-    assert list(summary["own"]) == list(METRICS)
-    mean, low, high = interval(np.array([1.0, 2.0, 3.0, 6.0]))
-    assert summary["own"]["gospa"] == {"mean": mean, "low": low, "high": high}
-    assert mean == 3.0
-    rows = list(csv.DictReader((tmp_path / "episodes.csv").read_text().splitlines()))
-    assert list(rows[0]) == ["policy", "episode", *METRICS]
-    assert [(row["policy"], row["episode"]) for row in rows] == [
-        (policy, str(episode)) for policy in RESULTS for episode in range(4)
-    ]
-    assert [float(row["completeness"]) for row in rows[8:]] == [6.0, 3.0, 2.0, 1.0]
-
-
-def test_the_table_shows_every_policy_and_the_paired_differences(capsys):
-    print_results(RESULTS, "own", Console(width=150))
-    said = capsys.readouterr().out
-    assert "4 scenarios, mean and half width of the 95 % interval" in said
-    for words in ("plus-one", "other", *METRICS.values()):
-        assert words in said
-    assert "GOSPA of own minus plus-one: -1.0 m, 95 % interval [-1.0, -1.0]" in said
+def test_without_out_nothing_is_written(monkeypatch, tmp_path, capsys):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(evaluate, "play", lambda *arguments: THREE)
+    assert evaluate.main(["--policies", "random"]) == 0
+    assert list(tmp_path.iterdir()) == []
+    assert "4 scenarios" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
-    ("argv", "message"),
+    ("options", "message"),
     [
-        (["--episodes", "0"], r"^episodes = 0: expected an integer >= 1$"),
-        (["--seed", "-1"], r"^seed = -1: expected an integer >= 0$"),
-        (["--run", "nowhere"], r"^run = 'nowhere': expected a folder with a config.json$"),
+        (["--episodes", "0"], "episodes = 0: expected an integer >= 1"),
+        (["--seed", "-1"], "seed = -1: expected an integer >= 0"),
+        (["--run", "nowhere"], "run = 'nowhere': expected a folder with a config.json"),
+        (["--runs", "nowhere", "else"], "run = 'nowhere': expected a folder with a config.json"),
+        (["--policies", "best"], "policies = 'best': expected all, or some of random, static, coverage"),
+        (["--policies"], "policies: expected at least one name, or a run"),
+        (["--scenario", "moon"], "scenario = 'moon': expected paper, clutter, slow, births, or a .toml"),
+        (["--scenario", "moon.toml"], "config = 'moon.toml': "),
+        (["--scenario", "wrong.json"], "params.nonsense: no such field"),
+        (["--scenario", "negative.json"], "time_step = -1: expected a number in (0"),
+        (["--page", "results.md"], "page: expected a folder for its figures too, --out"),
+        (["--episodes", "few"], "--episodes"),
     ],
 )
-def test_the_command_refuses_wrong_options(argv, message):
-    with pytest.raises(ValueError, match=message):
-        evaluate.main(argv)
+def test_bad_input_is_one_line_and_code_2(monkeypatch, tmp_path, capsys, options, message):
+    (tmp_path / "wrong.json").write_text('{"nonsense": 1}')
+    (tmp_path / "negative.json").write_text('{"time_step": -1}')
+    before = sorted(tmp_path.iterdir())
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("sys.argv", ["evaluate", *options])
+    with pytest.raises(SystemExit) as stop:
+        run(evaluate.main)
+    assert stop.value.code == 2
+    said = capsys.readouterr()
+    assert said.err.startswith("error: ")
+    assert message in said.err
+    assert said.err.count("\n") == 1
+    assert sorted(tmp_path.iterdir()) == before
+
+
+@pytest.mark.parametrize("name", SCENARIOS)
+def test_scenarios_by_name_differ_from_the_papers_as_they_say(name):
+    env, params = build_scenario(name, [])
+    expected = dataclasses.replace(Params(), **SCENARIOS[name])
+    assert params == expected
+    assert env.static == StaticParams(reward="information")
+
+
+def test_fields_may_stand_in_tables_or_alone(tmp_path):
+    (tmp_path / "mixed.json").write_text(
+        '{"num_looks": 5, "static": {"map_size": 9}, "clutter_rate": 0.5, "params": {"time_step": 1}}'
+    )
+    env, params = build_scenario(str(tmp_path / "mixed.json"), [])
+    assert (env.static.num_looks, env.static.map_size) == (5, 9)
+    assert (params.clutter_rate, params.time_step) == (0.5, 1)
+
+
+def test_runs_bring_their_own_scenario_unless_one_is_named():
+    slow = TrainConfig(params=Params(time_step=0.05), static=StaticParams(num_truths=4))
+    env, params = build_scenario("", [slow, dataclasses.replace(slow, seed=1)])
+    assert (env.static.num_truths, params.time_step) == (4, 0.05)
+    assert build_scenario("paper", [slow])[1].time_step == 0.005
+    with pytest.raises(ValueError, match=r"^scenario: expected one by name, the runs were trained on diff"):
+        build_scenario("", [slow, TrainConfig()])
+
+
+def test_a_run_must_fit_the_scenario():
+    config = TrainConfig(static=StaticParams(max_tracks=7))
+    check_shapes(Path("runs/a"), config, StaticParams(max_tracks=7, num_truths=3, max_clutter=2))
+    with pytest.raises(ValueError, match=r"^runs = 'runs/a': trained with max_tracks = 7, scenario has 20$"):
+        check_shapes(Path("runs/a"), config, StaticParams())
+
+
+def test_runs_that_differ_in_their_seed_are_one_policy():
+    cells = TrainConfig(out="a")
+    longer = dataclasses.replace(cells, total_steps=10**6)
+    mhsa = TrainConfig(encoder="mhsa", seed=4)
+    runs = [
+        (Path("x/a"), cells, "weights of a"),
+        (Path("x/m"), mhsa, "weights of m"),
+        (Path("x/b"), dataclasses.replace(cells, seed=1, out="b"), "weights of b"),
+    ]
+    grouped = group_runs(runs, greedy=False)
+    assert list(grouped) == ["cells", "mhsa"]
+    assert grouped["cells"].seeds == (0, 1)
+    assert grouped["cells"].weights == ["weights of a", "weights of b"]
+    assert grouped["mhsa"].seeds == (4,)
+    assert list(group_runs([*runs, (Path("x/l"), longer, "l")], False)) == ["cells (a)", "mhsa", "cells (l)"]
+    with pytest.raises(ValueError, match=r"^runs = 'x/again': seed 0 of this policy is given twice$"):
+        group_runs([*runs, (Path("x/again"), cells, "again")], greedy=False)
+
+
+def test_baselines_come_once_and_in_the_order_asked_for(monkeypatch):
+    assert list(baselines(["static", "random", "static"])) == ["static", "random"]
+    monkeypatch.setattr(evaluate, "POLICIES", {"one": None, "two": None})
+    assert list(baselines(["all"])) == ["one", "two"]
+    assert baselines([]) == {}

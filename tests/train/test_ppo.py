@@ -18,13 +18,14 @@ from jaxtrack.cli import run
 from jaxtrack.policies import POLICIES
 from train import evaluate, ppo
 from train.checkpoint import load_run
-from train.evaluate import METRICS
+from train.episode_metrics import METRICS
+from train.figures import FIGURES
 
 pytestmark = pytest.mark.usefixtures("quick_compilation")
 
 ROOT = Path(__file__).resolve().parents[2]
 BASELINES = {name: POLICIES[name] for name in ("static", "coverage")}
-PICTURES = ["learning_curve.png", "comparison.png", "episode.gif"]
+PICTURES = ["learning_curve.png", "episode.gif", *(f"{name}.png" for name in FIGURES)]
 SIZES = {
     "num-envs": 4,
     "rollout-steps": 8,
@@ -88,8 +89,9 @@ def test_a_whole_run_leaves_all_its_files(whole):
     for name in PICTURES:
         assert (folder / name).stat().st_size > 1000
     results = json.loads((folder / "results.json").read_text())
-    assert list(results) == ["cells", *BASELINES]
-    assert list(results["cells"]) == list(METRICS)
+    assert list(results["policies"]) == ["cells", *BASELINES]
+    assert results["policies"]["cells"]["training_seeds"] == [0]
+    assert list(results["policies"]["cells"]["metrics"]) == list(METRICS)
     lines = (folder / "episodes.csv").read_text().splitlines()
     assert len(lines) == 1 + 2 * (1 + len(BASELINES))
     assert set(json.loads((folder / "config.json").read_text())["static"]) == set(vars(StaticParams()))
@@ -114,7 +116,8 @@ def test_a_whole_run_can_be_evaluated_again(whole, tmp_path, capsys):
     )
     own = [line.split(",")[1:] for line in before if line.startswith("cells")]
     again = [line.split(",")[1:] for line in after[1:]]
-    np.testing.assert_allclose(np.array(again, dtype=float), np.array(own, dtype=float), rtol=1e-4)
+    again, own = (np.array([[cell or "nan" for cell in row] for row in rows], float) for rows in (again, own))
+    np.testing.assert_allclose(again, own, rtol=1e-4)
 
 
 def train_again(whole, folder, monkeypatch, **changes):
