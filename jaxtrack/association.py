@@ -95,7 +95,7 @@ def gate(distances: jax.Array, predicted: Tracks, detections: Detections, params
 
     A pair is admissible if track and detection exist and the distance is strictly smaller
     than both the gate threshold and the missed distance (a detection exactly at the missed
-    distance loses to the missed hypothesis).
+    distance loses to the missed hypothesis). NaN is not smaller, so it is refused.
     """
     exists = predicted.active[:, None] & detections.active[None]
     near = distances < jnp.minimum(params.gate_threshold, params.missed_distance)
@@ -126,7 +126,7 @@ def associate_nearest_neighbour(admissible: jax.Array) -> jax.Array:
         mutual = nearest_track[nearest_detection] == tracks
         taken = mutual & jnp.isfinite(left.min(axis=1))
         associated = jnp.where(taken, nearest_detection, associated)
-        used = jnp.any((associated[:, None] == rows) & taken[:, None], axis=0)
+        used = jnp.any(associated[:, None] == rows, axis=0)
         return jnp.where(taken[:, None] | used, jnp.inf, left), associated
 
     nothing = jnp.full(num_tracks, NO_DETECTION)

@@ -137,15 +137,13 @@ class SearchTrack(environment.Environment[EnvState, Params]):
     ) -> tuple[EnvState, StepRecord]:
         """The deterministic core: truths move, the radar looks, the tracker runs."""
         time = state.time + 1
-        truths, num_born = propagate_truths(state.truths, state.num_born, noise.truths, time, params)
+        truths, num_born, rowless = propagate_truths(state.truths, state.num_born, noise.truths, time, params)
         look = look_angles(action, self.static, params)
         detections, num_dropped = detect(truths, look, noise.sensor, self.static, params)
         measure = MEASURES[self.static.measure]
         tracks, info = tracker.step(state.tracks, detections, params.time_step, time, params, measure)
         scan_map = update_scan_map(state.scan_map, look, self.static, params)
         num_initiated = state.num_initiated + jnp.sum(info.initiated)
-        rows = self.static.num_truths
-        rowless = jnp.maximum(num_born, rows) - jnp.maximum(state.num_born, rows)
         state = EnvState(time, truths, tracks, scan_map, num_born, num_initiated)
         return state, StepRecord(look, detections, rowless, num_dropped, info)
 

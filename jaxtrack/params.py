@@ -150,9 +150,9 @@ class Params:
     kappa: float = _quantity(-3.0, "1", -6.0, open_low=True)
     """Unscented transform: secondary spread of the sigma points."""
     gate_threshold: float = _quantity(5.0, "1", 0.0, open_low=True)
-    """A detection is considered if its Mahalanobis distance is smaller than this."""
+    """A detection is considered if its distance is smaller than this (unit of the measure)."""
     missed_distance: float = _quantity(5.0, "1", 0.0, open_low=True)
-    """Distance at which a missed detection is the better explanation."""
+    """Distance at which a missed detection is the better explanation (unit of the measure)."""
     prior_velocity_sigma: float = _quantity(30.0, "m/s", 0.0, open_low=True)
     """Standard deviation of a new track's velocity, each axis (m/s)."""
     deletion_threshold: float = _quantity(5_000.0, "m^2 + m^2/s^2", 0.0, open_low=True)
@@ -196,13 +196,8 @@ def validate(static: StaticParams, params: Params) -> None:
             f"clutter_rate = {params.clutter_rate}: expected at most max_clutter = "
             f"{static.max_clutter} 1/look"
         )
-    if static.stop_metric is not None and params.stop_threshold is None:
-        raise ValueError(f"stop_threshold = None: expected a number for stop_metric = {static.stop_metric!r}")
-    first = static.num_truths if params.initial_truths is None else np.asarray(params.initial_truths)
-    if np.any(first < 0) or np.any(first > static.num_truths):
-        raise ValueError(
-            f"initial_truths = {params.initial_truths}: expected an integer in [0, {static.num_truths}]"
-        )
+    _check_stop(static, params)
+    _check_initial_truths(static, params)
     check_trajectories(static, params)
 
 
@@ -215,6 +210,27 @@ def check_trajectories(static: StaticParams, params: Params) -> None:
                 f"trajectories has shape {np.shape(params.trajectories)}: expected "
                 f"[times, num_truths = {static.num_truths}, 6]"
             )
+
+
+def _check_stop(static: StaticParams, params: Params) -> None:
+    if static.stop_metric is None and params.stop_threshold is None:
+        return
+    threshold = params.stop_threshold
+    numeric = threshold is not None and np.asarray(threshold).dtype.kind in "fiu"
+    if not numeric or not np.all(np.isfinite(np.asarray(threshold, dtype=float))):
+        raise ValueError(
+            f"stop_threshold = {threshold!r}: expected a number for stop_metric = {static.stop_metric!r}"
+        )
+
+
+def _check_initial_truths(static: StaticParams, params: Params) -> None:
+    if params.initial_truths is None:
+        return
+    first = np.asarray(params.initial_truths)
+    if first.dtype.kind not in "iu" or np.any(first < 0) or np.any(first > static.num_truths):
+        raise ValueError(
+            f"initial_truths = {params.initial_truths!r}: expected an integer in [0, {static.num_truths}]"
+        )
 
 
 def _check_quantity(field: dataclasses.Field, value: Any) -> None:

@@ -24,7 +24,7 @@ def to_platform(states: jax.Array, place: jax.Array, orientation: jax.Array) -> 
 
 
 def from_platform(states: jax.Array, place: jax.Array, orientation: jax.Array) -> jax.Array:
-    """Inverse of `to_platform`."""
+    """Inverse of `to_platform`, with the same arguments: states of the platform's frame in the world."""
     turn = rotation(orientation)
     return _interleaved(position(states) @ turn + place, velocity(states) @ turn)
 

@@ -56,9 +56,10 @@ def information(
 def accuracy(
     before: Tracks, after: Tracks, truths: Truths, static: StaticParams, params: Params
 ) -> jax.Array:
-    """``1 - GOSPA / GOSPA without tracks``: 1 if every truth is tracked exactly, 0 without tracks.
+    """``1 - GOSPA / GOSPA without tracks``: 1 if the tracks are the truths, 0 without tracks.
 
-    Negative where false tracks cost more than the true ones gain.
+    Negative where false tracks cost more than the true ones gain; without a living truth the
+    divisor is that of one.
     """
     del before, static
     num_truths = jnp.maximum(jnp.sum(truths.alive), 1)

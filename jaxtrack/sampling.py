@@ -7,7 +7,10 @@ from jaxtrack.types import Scalar
 
 
 def poisson_quantile(uniform: jax.Array, rate: Scalar, largest: int) -> jax.Array:
-    """Poisson number `[]` of one uniform draw `[]` in [0, 1), at most `largest`; 0 at rate 0."""
+    """Poisson number `[]` of one uniform draw `[]` in [0, 1), cut off at `largest`; 0 at rate 0.
+
+    `rate` must leave ``exp(-rate)`` above zero in float32: at most 80.
+    """
     if not largest:
         return jnp.asarray(0)
     counts = jnp.arange(largest)

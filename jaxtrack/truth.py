@@ -12,6 +12,9 @@ from jaxtrack.params import Params, StaticParams
 from jaxtrack.sampling import poisson_quantile
 from jaxtrack.types import Scalar, Truths
 
+MOST_BIRTHS = 4
+"""Births of one step are cut off at this many times the number of rows."""
+
 
 class TruthNoise(struct.PyTreeNode):
     """The random draws of one step of the truths.
@@ -36,7 +39,10 @@ def sample_truth_noise(key: jax.Array, key_life: jax.Array, num_truths: int) -> 
 
 
 def initiate_truths(key: jax.Array, static: StaticParams, params: Params) -> Truths:
-    """Truths at the start: uniform in azimuth, elevation and range, normal in velocity."""
+    """Truths `[N]` at the start: uniform in azimuth, elevation and range, normal in velocity.
+
+    The first `initial_truths` of them live; with trajectories, the first row of the recording.
+    """
     if params.trajectories is not None:
         return replay_truths(jnp.asarray(0), params)
     key_angles, key_range, key_velocity = jax.random.split(key, 3)
@@ -66,7 +72,7 @@ def born_state(angles: jax.Array, share: jax.Array, velocity: jax.Array, params:
 
 def propagate_truths(
     truths: Truths, num_born: jax.Array, noise: TruthNoise, step: jax.Array, params: Params
-) -> tuple[Truths, jax.Array]:
+) -> tuple[Truths, jax.Array, jax.Array]:
     """Deaths, motion, births, in Stone Soup's order; or the recording where there is one.
 
     Args:
@@ -77,13 +83,16 @@ def propagate_truths(
         params: numbers of the scenario.
 
     Returns:
-        The truths after the step, and the new `num_born`.
+        The truths after the step, the new `num_born`, and the births of this step for which no
+        row was left.
     """
     if params.trajectories is not None:
-        return replay_truths(step, params), num_born
+        return replay_truths(step, params), num_born, jnp.zeros_like(num_born)
     surviving = end_truths(truths, noise.death, params)
     moved = move_truths(surviving, noise.motion, params)
-    return begin_truths(moved, num_born, noise, params)
+    truths, num_wanted = begin_truths(moved, num_born, noise, params)
+    rows = truths.alive.shape[0]
+    return truths, num_wanted, jnp.maximum(num_wanted, rows) - jnp.maximum(num_born, rows)
 
 
 def end_truths(truths: Truths, uniform: jax.Array, params: Params) -> Truths:
@@ -105,16 +114,30 @@ def move_truths(truths: Truths, noise: jax.Array, params: Params) -> Truths:
 def begin_truths(
     truths: Truths, num_born: jax.Array, noise: TruthNoise, params: Params
 ) -> tuple[Truths, jax.Array]:
-    """A Poisson number of new truths, in rows never used: a row is one truth for the whole episode."""
-    rows = truths.alive.shape[0]
-    births = poisson_quantile(noise.birth_count, params.birth_rate, 4 * rows)
-    row = jnp.arange(rows)
+    """A Poisson number of new truths, in rows never used: a row is one truth for the whole episode.
+
+    Returns:
+        The truths, and `num_born` with the new ones, those without a row included.
+    """
+    row = jnp.arange(truths.alive.shape[0])
+    births = num_births(noise, params)
     born = (row >= num_born) & (row < num_born + births)
-    # A newborn does not move: its six draws of motion serve for its place and velocity.
-    uniform = jax.scipy.stats.norm.cdf(noise.motion[:, :, 0])
-    state = born_state(2 * uniform[:, :2] - 1, uniform[:, 2:], noise.motion[:, :, 1], params)
-    state = jnp.where(born[:, None], state, truths.state)
+    state = jnp.where(born[:, None], newborn_states(noise, params), truths.state)
     return Truths(state=state, alive=truths.alive | born), num_born + births
+
+
+def num_births(noise: TruthNoise, params: Params) -> jax.Array:
+    """Births `[]` wanted on a step, at most `MOST_BIRTHS` times the number of rows."""
+    return poisson_quantile(noise.birth_count, params.birth_rate, MOST_BIRTHS * noise.death.shape[0])
+
+
+def newborn_states(noise: TruthNoise, params: Params) -> jax.Array:
+    """States `[N, 6]` that the rows would have if they were born on this step.
+
+    A newborn does not move: its six draws of motion serve for its place and velocity.
+    """
+    uniform = jax.scipy.stats.norm.cdf(noise.motion[:, :, 0])
+    return born_state(2 * uniform[:, :2] - 1, uniform[:, 2:], noise.motion[:, :, 1], params)
 
 
 def process_noise_factor(time_step: Scalar, process_noise: Scalar) -> jax.Array:

@@ -118,12 +118,13 @@ def initial_states(rng: np.random.Generator, count: int, params: Params) -> np.n
 def truth_simulator(states: np.ndarray, seed: int, params: Params) -> FieldTruths:
     """Truths for one episode that start at the given states `[M, 6]`, with Stone Soup's own draws."""
     rng = np.random.default_rng(seed)
+    motion_seed, life_seed = (int(number) for number in rng.integers(2**31, size=2))
     return _simulator(
         states,
         params,
-        transition_model=transition_model(params.truth_process_noise, seed),
+        transition_model=transition_model(params.truth_process_noise, motion_seed),
         newborn=lambda: initial_states(rng, 1, params)[0],
-        seed=seed,
+        seed=life_seed,
     )
 
 

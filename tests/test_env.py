@@ -299,6 +299,10 @@ def test_nothing_random_serves_twice(env):
         ({"info_metrics": ("ospa",)}, "info_metrics = 'ospa': expected one of gospa, "),
         ({"stop_metric": "ospa", "stop_threshold": 1.0}, "stop_metric = 'ospa': expected one of gospa, "),
         ({"stop_metric": "gospa"}, "stop_threshold = None: expected a number for stop_metric = 'gospa'"),
+        ({"stop_metric": "gospa", "stop_threshold": float("nan")}, "stop_threshold = nan: expected a number"),
+        ({"stop_threshold": "much"}, "stop_threshold = 'much': expected a number"),
+        ({"initial_truths": 2.5}, r"initial_truths = 2.5: expected an integer in \[0, 10\]"),
+        ({"initial_truths": 11}, r"initial_truths = 11: expected an integer in \[0, 10\]"),
     ],
 )
 def test_metrics_that_do_not_exist_are_refused(fields, message):

@@ -112,7 +112,7 @@ def test_recordings_replace_birth_and_motion(recording, static):
     np.testing.assert_array_equal(truths.alive, [True, False, True])
     np.testing.assert_array_equal(truths.state[0], recording[0, 0])
     np.testing.assert_array_equal(truths.state[1], np.zeros(6))
-    truths, _ = propagate(truths, jnp.asarray(2), draws(3, motion=1.0), 1, params)
+    truths, _, _ = propagate(truths, jnp.asarray(2), draws(3, motion=1.0), 1, params)
     np.testing.assert_array_equal(truths.alive, [True, True, False])
     np.testing.assert_array_equal(truths.state[:2], recording[1, :2])
 
@@ -120,7 +120,7 @@ def test_recordings_replace_birth_and_motion(recording, static):
 def test_the_last_row_stays_after_the_end_of_a_recording(recording, static):
     params = Params(trajectories=jnp.asarray(recording))
     truths = initiate(jax.random.key(0), static, params)
-    after, _ = propagate(truths, jnp.asarray(2), draws(3), 7, params)
+    after, _, _ = propagate(truths, jnp.asarray(2), draws(3), 7, params)
     np.testing.assert_array_equal(after.state[:2], recording[1, :2])
     np.testing.assert_array_equal(after.alive, [True, True, False])
 
@@ -139,9 +139,9 @@ def test_deaths_come_before_and_births_after_motion():
     # The newborn has a velocity, with which it must not have moved yet.
     motion = jnp.zeros((4, 3, 2)).at[2, :, 1].set(1.0)
     noise = draws(4, motion, death=jnp.array([0.1, 0.2, 0.0, 0.0]), birth_count=0.5)
-    after, num_born = propagate(truths, jnp.asarray(2), noise, 1, params)
+    after, num_born, rowless = propagate(truths, jnp.asarray(2), noise, 1, params)
     np.testing.assert_array_equal(after.alive, [False, True, True, False])
-    assert int(num_born) == 3
+    assert (int(num_born), int(rowless)) == (3, 0)
     assert float(after.state[1, 0]) == 2010.0
     # Draws of zero are the middle of the field.
     middle, speed = (params.min_range + params.max_range) / 2, params.truth_velocity_sigma
@@ -151,16 +151,17 @@ def test_deaths_come_before_and_births_after_motion():
 def test_the_row_of_a_dead_truth_is_not_used_again():
     params = Params(birth_rate=1.0)
     truths = Truths(state=jnp.zeros((3, 6)), alive=jnp.array([False, True, True]))
-    after, num_born = propagate(truths, jnp.asarray(3), draws(3, birth_count=0.9), 1, params)
+    after, num_born, rowless = propagate(truths, jnp.asarray(3), draws(3, birth_count=0.9), 1, params)
     np.testing.assert_array_equal(after.alive, truths.alive)
-    assert int(num_born) == 5  # two births that found no row
+    # Two births that found no row.
+    assert (int(num_born), int(rowless)) == (5, 2)
 
 
 def test_more_births_than_rows_are_all_counted():
     crowd, nobody = Params(birth_rate=6.0), Truths(state=jnp.zeros((3, 6)), alive=jnp.zeros(3, dtype=bool))
-    after, num_born = propagate(nobody, jnp.asarray(1), draws(3, birth_count=0.9), 1, crowd)
+    after, num_born, rowless = propagate(nobody, jnp.asarray(1), draws(3, birth_count=0.9), 1, crowd)
     np.testing.assert_array_equal(after.alive, [False, True, True])
-    assert int(num_born) == 1 + 9  # P(at most 8) = 0.85 and P(at most 9) = 0.92 at rate 6
+    assert (int(num_born), int(rowless)) == (10, 8)  # P(at most 8) = 0.85, P(at most 9) = 0.92 at rate 6
 
 
 def test_no_draw_serves_twice():
@@ -177,7 +178,7 @@ def test_births_and_deaths_are_as_frequent_as_asked():
 
     def step(carry, key):
         noise = sample_truth_noise(key, jax.random.fold_in(key, 1), MANY.num_truths)
-        truths, num_born = propagate_truths(*carry, noise, 1, params)
+        truths, num_born, _ = propagate_truths(*carry, noise, 1, params)
         return (truths, num_born), (jnp.sum(carry[0].alive), jnp.sum(truths.alive), num_born)
 
     before, after, num_born = jax.jit(lambda: jax.lax.scan(step, (truths, 3000), keys)[1])()

@@ -271,8 +271,9 @@ def summarise(
 ) -> dict[str, jax.Array]:
     """Means over a rollout; episode returns over whole episodes only, NaN where none ended."""
     # The first episodes are cut short by the different times at which they start.
-    whole = finished["terminated"] | (finished["episode_length"] == params.max_steps_in_episode)
-    whole &= finished["done"]
+    whole = finished["done"] & (
+        finished["terminated"] | (finished["episode_length"] == params.max_steps_in_episode)
+    )
     count = whole.sum()
     total = jnp.where(whole, finished["episode_return"], 0.0).sum()
     means = {name: values.mean() for name, values in logged.items()}

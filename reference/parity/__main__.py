@@ -49,7 +49,7 @@ class ParityOptions:
     records: int = 50
     """Random records on which the metrics are compared."""
     environments: int = 12
-    """Episodes of the two environments from the same draws, 200 steps each."""
+    """Episodes of the two environments from the same draws, 200 steps each, the rewards in turn."""
     seed: int = 0
     """Number of the first random scenario."""
     processes: int = 0
@@ -66,7 +66,7 @@ QUICK: dict[str, Any] = {
     "steps": 40,
     "samples": 60,
     "records": 3,
-    "environments": 1,
+    "environments": 4,
 }
 
 

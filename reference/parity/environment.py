@@ -13,8 +13,7 @@ from jaxtrack import models
 from jaxtrack.env import EnvState, SearchTrack, StepNoise
 from jaxtrack.params import REWARDS, Params, StaticParams
 from jaxtrack.reward import reward_terms
-from jaxtrack.sampling import poisson_quantile
-from jaxtrack.truth import born_state
+from jaxtrack.truth import newborn_states, num_births
 from jaxtrack.types import Truths
 from reference.components import step_duration, transition_model
 from reference.gym_env import StoneSoupEnv
@@ -99,12 +98,8 @@ def draws_of(played: Played, params: Params) -> Draws:
     Q = transition_model(params.truth_process_noise).covar(time_interval=step_duration(params))
     factor = np.linalg.cholesky(Q[:2, :2]) if params.truth_process_noise else np.zeros((2, 2))
     with jax.enable_x64(True):
-        births = jax.vmap(poisson_quantile, in_axes=(0, None, None))(
-            noise.birth_count, params.birth_rate, 4 * shape[1]
-        )
-        uniform = jax.scipy.stats.norm.cdf(noise.motion[..., 0])
-        place = jax.vmap(born_state, in_axes=(0, 0, 0, None))
-        newborn = place(2 * uniform[..., :2] - 1, uniform[..., 2:], noise.motion[..., 1], params)
+        births = jax.vmap(num_births, in_axes=(0, None))(noise, params)
+        newborn = jax.vmap(newborn_states, in_axes=(0, None))(noise, params)
     sigma = np.array([params.elevation_sigma, params.bearing_sigma, params.range_sigma])
     return Draws(
         initial=np.asarray(played.initial.state)[np.asarray(played.initial.alive)],
@@ -125,7 +120,7 @@ class EnvironmentTallies:
 
 
 def environment_rows(seeds: Iterable[int], steps: int) -> tuple[list[Row], list[Divergence]]:
-    """Episodes with births and deaths, the three rewards in turn; rows, and what diverged."""
+    """Episodes with births and deaths, the rewards in turn; rows, and what diverged."""
     tallies, divergences = EnvironmentTallies(), []
     for seed in seeds:
         static = dataclasses.replace(STATIC, reward=REWARDS[seed % len(REWARDS)])

@@ -371,6 +371,7 @@ GOOD = Row("a", "b", 10, "steps", 1e-12, agreement=1.0)
         ({"agreement": 0.9999}, False),
         ({"compared": 0}, False),
         ({"float64": None}, True),
+        ({"float64": None, "agreement": None}, False),
         ({"float64": 2e-9, "tolerance": 1e-6}, True),
     ],
 )
