@@ -3,7 +3,8 @@
 In the expected world a look detects every live track whose predicted mean lies in its beam,
 exactly where it is expected, and the detection belongs to that track. So covariances fall as
 the filter says, means stay predicted, nothing is random and no truth is read. No track is ever
-found there: what search may find pays only through the scan map.
+found there: what search may find pays only through the scan map. And no track is ever missed: one
+that has lost its truth, or shares it with another, is looked at again and again until it is deleted.
 
 Counterparts in Stone Soup: `BruteForceSensorManager` with a `RewardFunction`.
 
@@ -75,10 +76,13 @@ def rollout(
 ) -> Policy:
     """The look after which a base policy collects most reward in the expected world.
 
+    One step of policy improvement (a rollout, as in Bertsekas).
+
     Args:
         static: shapes; their reward is not read.
         params: numbers.
-        candidates: looks that are tried: the best ones by `greedy`.
+        candidates: looks that are tried: the best ones by `greedy`; the base policy's own is
+            tried too, so that in the expected world the choice is never worse than that policy.
         horizon: steps of the base policy after each; with 0 the choice is that of `greedy`.
         discount: weight of a step's reward over that of the step before.
         base: builder of the base policy.
@@ -111,6 +115,7 @@ def rollout(
         expected = expected_rewards(state, looks, pixels, static, params)
         best = jax.lax.top_k(expected, candidates)[1]
         actions = jax.vmap(to_action, in_axes=(0, None, None))(best, static, params)
+        actions = jnp.concatenate([actions, base_policy(key, state)[None]])
         return actions[jnp.argmax(jax.vmap(collected)(actions))]
 
     return policy
