@@ -1,9 +1,12 @@
 """Plays policies on the same scenarios, in chunks of episodes, as one compiled program."""
 
 import dataclasses
+import itertools
 import math
+import os
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import jax
@@ -15,8 +18,11 @@ from jaxtrack.params import Params
 from jaxtrack.policies import Policy, PolicyBuilder
 from train.episode_metrics import CURVES, METRICS, StepRow, episode_curves, episode_values, step_row
 
-MEMORY = 400e6
-"""Bytes that the record of a chunk may take."""
+MEMORY = 200e6
+"""Bytes that the record of a chunk may take. The same on every machine, because rounding differs with
+the size of a chunk, and a policy that meets a tie may then take another look."""
+MOST_WORKERS = 8
+"""Chunks that are played at the same time, at most."""
 BYTES_PER_PAIR = 32
 """What a step of a chunk takes per pair of truth and track slot."""
 
@@ -126,19 +132,35 @@ def compare(
     started = time.perf_counter()
     program = compile_program(competitors, env, params, length, chunks[0][0])
     compiled = time.perf_counter()
-    played = {}
-    for which, (name, competitor) in enumerate(competitors.items()):
-        sums = Sums(length, env.static.num_looks)
-        for weights in competitor.weights:
-            everyones = [
-                weights if i == which else one.weights[0] for i, one in enumerate(competitors.values())
-            ]
-            for keys, number in chunks:
-                chunk = jax.device_get(program(keys, jnp.asarray(which), everyones, params))
-                sums.add(*jax.tree.map(lambda leaf, number=number: leaf[:number], chunk))
-                advance(number)
-        played[name] = sums.result(competitor.seeds, len(competitor.weights))
+    rounds = [(which, weights) for which, one in enumerate(competitors.values()) for weights in one.weights]
+
+    def play(task: tuple[tuple[int, Any], tuple[jax.Array, int]]) -> Any:
+        (which, weights), (keys, number) = task
+        everyones = [weights if i == which else one.weights[0] for i, one in enumerate(competitors.values())]
+        chunk = jax.device_get(program(keys, jnp.asarray(which), everyones, params))
+        return which, number, jax.tree.map(lambda leaf: leaf[:number], chunk)
+
+    sums = [Sums(length, env.static.num_looks) for _ in competitors]
+    pool = ThreadPoolExecutor(workers())
+    try:
+        for which, number, chunk in pool.map(play, itertools.product(rounds, chunks)):
+            sums[which].add(*chunk)
+            advance(number)
+    finally:
+        pool.shutdown(cancel_futures=True)
+    played = {
+        name: own.result(one.seeds, len(one.weights))
+        for own, (name, one) in zip(sums, competitors.items(), strict=True)
+    }
     return Comparison(played, compiled - started, time.perf_counter() - compiled)
+
+
+def workers() -> int:
+    """Chunks that are played at the same time: XLA takes little more than one core for one."""
+    if jax.default_backend() != "cpu":
+        return 1
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return min(cores, MOST_WORKERS)
 
 
 def compile_program(

@@ -38,6 +38,8 @@ PARAMS = Params(
     deletion_threshold=4000.0,
 )
 ENV = SearchTrack(STATIC)
+# Memory for a little more, of which three equal chunks are made.
+SEVEN_EPISODES = 9 * episodes.BYTES_PER_PAIR * LENGTH * 12
 
 
 def fixed(index):
@@ -76,7 +78,7 @@ def compared():
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(episodes, "compile_program", compile_and_keep)
-        patch.setattr(episodes, "MEMORY", 9 * episodes.BYTES_PER_PAIR * LENGTH * 12)
+        patch.setattr(episodes, "MEMORY", SEVEN_EPISODES)
         return compare(COMPETITORS, ENV, PARAMS, EPISODES, 7, told.append), told, kept[0]
 
 
@@ -273,7 +275,7 @@ def test_planted_errors_change_the_table(compared, monkeypatch):
     comparison, _, compiled = compared
     monkeypatch.setattr(episodes, "compile_program", lambda *_: compiled)
     wrong_sign = PARAMS.replace(track_weight=-PARAMS.track_weight)
-    monkeypatch.setattr(episodes, "MEMORY", 9 * episodes.BYTES_PER_PAIR * LENGTH * 12)
+    monkeypatch.setattr(episodes, "MEMORY", SEVEN_EPISODES)
     turned = summarise(compare(COMPETITORS, ENV, wrong_sign, EPISODES, 7).played).mean["index"]
     table = summarise(comparison.played).mean
     # Azimuth and elevation swapped: the rule looks beside its tracks.
