@@ -104,19 +104,14 @@ def rollout(
     base_policy = base(static, params)
 
     def policy(key: jax.Array, state: "EnvState") -> jax.Array:
-        def one_step(state: "EnvState", weight: jax.Array) -> tuple["EnvState", jax.Array]:
-            state, value = expected_step(state, base_policy(key, state), static, params)
-            return state, weight * value
-
-        def collected(action: jax.Array) -> jax.Array:
-            after, first = expected_step(state, action, static, params)
-            return first + jax.lax.scan(one_step, after, discount ** jnp.arange(1, horizon + 1))[1].sum()
-
         expected = expected_rewards(state, looks, pixels, static, params)
         best = jax.lax.top_k(expected, candidates)[1]
         actions = jax.vmap(to_action, in_axes=(0, None, None))(best, static, params)
         actions = jnp.concatenate([actions, base_policy(key, state)[None]])
-        return actions[jnp.argmax(jax.vmap(collected)(actions))]
+        returns = jax.vmap(
+            lambda action: expected_return(key, state, action, base_policy, horizon, discount, static, params)
+        )(actions)
+        return actions[jnp.argmax(returns)]
 
     return policy
 
@@ -185,6 +180,27 @@ def expected_step(
     scan_map = update_scan_map(state.scan_map, look, static, params)
     track, search = reward_terms(state.tracks, tracks, _no_truths(), scan_map, static, params)
     return state.replace(time=state.time + 1, tracks=tracks, scan_map=scan_map), track + search
+
+
+def expected_return(
+    key: jax.Array,
+    state: "EnvState",
+    action: jax.Array,
+    base: Policy,
+    horizon: int,
+    discount: float,
+    static: StaticParams,
+    params: Params,
+) -> jax.Array:
+    """Discounted sum of the rewards of an action and of `horizon` steps of a base policy after it."""
+
+    def one_step(state: "EnvState", weight: jax.Array) -> tuple["EnvState", jax.Array]:
+        state, reward = expected_step(state, base(key, state), static, params)
+        return state, weight * reward
+
+    state, first = expected_step(state, action, static, params)
+    rest = jax.lax.scan(one_step, state, discount ** jnp.arange(1, horizon + 1))[1]
+    return first + rest.sum()
 
 
 def expected_outcomes(tracks: Tracks, params: Params) -> tuple[Tracks, Tracks]:

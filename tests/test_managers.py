@@ -14,6 +14,7 @@ from jaxtrack.managers import (
     MANAGERS,
     REWARDS,
     beam_pixels,
+    expected_return,
     expected_rewards,
     expected_step,
     greedy,
@@ -225,10 +226,18 @@ def test_rollout_collects_the_rewards_of_the_base_policy(scenes, slow):
     few = np.full_like(totals, -np.inf)
     np.put_along_axis(few, tried, np.take_along_axis(totals, tried, axis=1), axis=1)
     assert_best(act_on_all(PLANNER, scenes), few, margin=1e-5)
-    # The best of all, of the few, without discount, and of the next reward are different choices.
-    plain = np.where(np.isfinite(few), futures.sum(axis=1), -np.inf)
-    choices = [values.argmax(axis=1) for values in (totals, few, plain, slow[1]["information"])]
-    assert len({tuple(choice) for choice in choices}) == 4
+    assert len({tuple(values.argmax(axis=1)) for values in (totals, few, slow[1]["information"])}) == 3
+
+    information, base = dataclasses.replace(STATIC, reward="information"), index(STATIC, PARAMS)
+    ours = jax.vmap(
+        lambda state, action: expected_return(
+            KEY, state, action, base, HORIZON, DISCOUNT, information, PARAMS
+        ),
+        in_axes=(0, None),
+    )
+    action = [2, 3]
+    returns = jax.jit(ours)(scenes, jnp.array(action))
+    np.testing.assert_allclose(returns, totals[:, action[0] * L + action[1]], rtol=1e-4, atol=1e-5)
 
 
 @pytest.mark.parametrize("name", BUILDERS)
