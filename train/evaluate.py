@@ -82,8 +82,8 @@ def main(argv: Sequence[str]) -> int:
     if options.out is not None:
         options.out.mkdir(parents=True, exist_ok=True)
         write_results(comparison, summary, env, params, options.seed, options.out)
-        draw_and_tell(comparison, summary, env, params, options, argv)
-        console.print(f"results.json, episodes.csv, curves.npz and figures in {options.out}")
+        page = draw_and_tell(comparison, summary, env, params, options, argv)
+        console.print(f"results.json, episodes.csv, curves.npz and figures in {options.out}; page in {page}")
     return 0
 
 
@@ -192,7 +192,7 @@ def draw_and_tell(
     params: Params,
     options: EvaluateOptions,
     argv: Sequence[str],
-) -> None:
+) -> Path:
     """Draws the figures into the folder of the results, and writes the page that shows them."""
     from train import figures, results_page
 
@@ -206,6 +206,7 @@ def draw_and_tell(
             comparison, summary, env.static, params, options.seed, command, drawn, page.parent
         )
     )
+    return page
 
 
 if __name__ == "__main__":
