@@ -89,6 +89,8 @@ def measure(options: ParityOptions, progress: Progress) -> tuple[list[Row], list
     processes = options.processes or len(os.sched_getaffinity(0))
 
     def follow(items: Iterable[Item], total: int, what: str) -> Iterator[Item]:
+        if progress.disable:  # in a log, a line where a bar would begin
+            print(f"{what}: {total}", file=sys.stderr, flush=True)
         yield from progress.track(items, total=total, description=what)
 
     first, last = options.seed, options.seed + options.scenarios
