@@ -86,13 +86,14 @@ class EpisodeTallies:
     """What is collected over many episodes against one kind of initiator."""
 
     def __init__(self) -> None:
-        self.steps, self.decisions, self.ties = 0, 0, 0
+        self.steps, self.births, self.decisions, self.ties = 0, 0, 0, 0
         self.state, self.birth = Tally(), Tally()
         self.divergences: list[tuple[int, Divergence]] = []
 
     def add(self, number: int, comparison: Comparison) -> None:
         """Takes one episode; a divergence counts as one decision that disagrees."""
         self.steps += comparison.steps
+        self.births += comparison.births
         self.decisions += comparison.decisions
         self.ties += comparison.tie
         self.state.error(comparison.error)

@@ -61,8 +61,8 @@ def _rows(episodes: int, double: EpisodeTallies, single: EpisodeTallies, stock: 
         Row(
             "lifecycle.initial_estimate",
             "SimpleMeasurementInitiator, whole episodes",
-            double.steps,
-            "steps",
+            double.births,
+            "births",
             float64=double.birth.largest,
             float32=single.birth.largest,
             stock=stock.birth.largest,
@@ -79,5 +79,7 @@ def _rows(episodes: int, double: EpisodeTallies, single: EpisodeTallies, stock: 
             agreement32=single.agreement,
             agreement_stock=stock.agreement,
             ties=double.ties,
+            note=f"exact ties that ended an episode: {double.ties}; decisions of float32 and of the stock "
+            "initiator are counted up to their first difference",
         ),
     ]
