@@ -221,8 +221,13 @@ def test_every_variant_of_an_episode_has_its_own_figures(monkeypatch):
         assert (tolerance == TOLERANCE) is (exact_jacobian and is_double)
         size = variants[exact_jacobian, is_double]
         divergence = Divergence(1, None, "x", 0, 1)
-        return SimpleNamespace(
-            steps=5, decisions=size, error=size, birth_error=10 * size, tie=False, divergence=divergence
+        return Comparison(
+            steps=5,
+            births=size,
+            mean_error=size,
+            birth_error=10 * size,
+            tie=False,
+            divergence=divergence,
         )
 
     monkeypatch.setattr(free_running, "run_all", lambda jobs, _: [job.exact_jacobian for job in jobs])
@@ -231,7 +236,8 @@ def test_every_variant_of_an_episode_has_its_own_figures(monkeypatch):
     assert [(row.float64, row.float32, row.stock) for row in rows] == [(10, 20, 30), (1, 2, 3)]
     agreements = rows[1].agreement, rows[1].agreement32, rows[1].agreement_stock
     assert agreements == (1 / 2, 2 / 3, 3 / 4)
-    assert [row.compared for row in rows] == [10, 10]
+    # Births of the two episodes of the first variant, and steps.
+    assert [row.compared for row in rows] == [2, 10]
     kinds = ("", " (float32)", " (stock initiator)")
     assert lines == [f"episode {n}{kind}: step 1: x ours 0, Stone Soup 1" for kind in kinds for n in (0, 1)]
 
