@@ -17,7 +17,7 @@ from rich.progress import Progress
 from benchmarks.playing import Start, compile_play, first, pointing, raster
 from benchmarks.stone_soup import Look, play_stone_soup, pointing_look, random_look, raster_look
 from jaxtrack import policies
-from jaxtrack.cli import parse, run
+from jaxtrack.cli import parse, require_file, require_integer, run
 from jaxtrack.env import make
 from jaxtrack.params import Params, StaticParams
 from jaxtrack.report import circumstances, print_table, spread
@@ -60,18 +60,16 @@ def check(options: EnvironmentOptions, static: StaticParams, params: Params) -> 
     counts = {"repeats": options.repeats, "steps": options.steps}
     counts |= {"stone_soup_steps": options.stone_soup_steps, "num_envs": min(options.num_envs, default=0)}
     for name, value in counts.items():
-        if value < 1:
-            raise ValueError(f"{name} = {value}: expected an integer >= 1")
+        require_integer(name, value, 1)
     if len(set(options.num_envs)) < len(options.num_envs):
         raise ValueError(f"num_envs = {options.num_envs}: expected different numbers")
-    if options.seed < 0:
-        raise ValueError(f"seed = {options.seed}: expected an integer >= 0")
+    require_integer("seed", options.seed, 0)
     left = params.max_steps_in_episode - static.num_looks**2 - 1
     for name in ("steps", "stone_soup_steps"):
         if counts[name] > left:
             raise ValueError(f"{name} = {counts[name]}: expected at most {left}, the rest of the episode")
-    if options.out is not None and (options.out.is_dir() or not options.out.parent.is_dir()):
-        raise ValueError(f"out = {str(options.out)!r}: expected a file in a folder that exists")
+    if options.out is not None:
+        require_file("out", options.out)
 
 
 def time_ours(

@@ -13,7 +13,7 @@ import numpy as np
 from rich.progress import Progress
 
 from jaxtrack import policies
-from jaxtrack.cli import parse, run, wide_console
+from jaxtrack.cli import parse, require_file, require_integer, run, wide_console
 from jaxtrack.env import EnvState, make
 from jaxtrack.managers import expected_falls, greedy, rollout, uncertainty
 from jaxtrack.params import Params, StaticParams
@@ -62,16 +62,14 @@ def check(options: PlanningOptions, static: StaticParams) -> None:
             raise ValueError(f"{name} = {values}: expected different numbers")
         counts[name] = min(values)
     for name, value in counts.items():
-        if value < 1:
-            raise ValueError(f"{name} = {value}: expected an integer >= 1")
+        require_integer(name, value, 1)
     if max(options.candidates) > static.num_looks**2:
         raise ValueError(f"candidates = {max(options.candidates)}: expected at most {static.num_looks**2}")
     if not 0 < options.min_seconds < np.inf:
         raise ValueError(f"min_seconds = {options.min_seconds}: expected a number > 0")
-    if options.seed < 0:
-        raise ValueError(f"seed = {options.seed}: expected an integer >= 0")
-    if options.out is not None and (options.out.is_dir() or not options.out.parent.is_dir()):
-        raise ValueError(f"out = {str(options.out)!r}: expected a file in a folder that exists")
+    require_integer("seed", options.seed, 0)
+    if options.out is not None:
+        require_file("out", options.out)
 
 
 def managers(options: PlanningOptions) -> dict[str, policies.PolicyBuilder]:

@@ -14,7 +14,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from jaxtrack.cli import parse, run, wide_console
+from jaxtrack.cli import parse, require_file, require_integer, run, wide_console
 from jaxtrack.detection_file import COLUMNS, RecordedDetections, read_detections
 from jaxtrack.params import Params
 from jaxtrack.report import circumstances, print_table
@@ -52,12 +52,11 @@ class TrackingOptions:
 def check(options: TrackingOptions) -> None:
     """Raises ValueError, naming the option, before anything is measured."""
     for name, low in (("detections", 1), ("targets", 1), ("seed", 0)):
-        if getattr(options, name) < low:
-            raise ValueError(f"{name} = {getattr(options, name)}: expected an integer >= {low}")
+        require_integer(name, getattr(options, name), low)
     if not 0 < options.stone_soup_seconds < np.inf:
         raise ValueError(f"stone_soup_seconds = {options.stone_soup_seconds}: expected a number > 0")
-    if options.out is not None and (options.out.is_dir() or not options.out.parent.is_dir()):
-        raise ValueError(f"out = {str(options.out)!r}: expected a file in a folder that exists")
+    if options.out is not None:
+        require_file("out", options.out)
 
 
 def synthetic_scans(targets: int, seed: int) -> Iterator[np.ndarray]:

@@ -85,6 +85,18 @@ def read_config(path: Path) -> dict[str, Any]:
     return values
 
 
+def require_integer(name: str, value: int, low: int) -> None:
+    """Raises ValueError, naming the option, if its value is below `low`."""
+    if value < low:
+        raise ValueError(f"{name} = {value}: expected an integer >= {low}")
+
+
+def require_file(name: str, path: Path) -> None:
+    """Raises ValueError, naming the option, if no file can be written at its path."""
+    if path.is_dir() or not path.parent.is_dir():
+        raise ValueError(f"{name} = {str(path)!r}: expected a file in a folder that exists")
+
+
 def wide_console() -> "Console":
     """Console for tables: the terminal's width, or 150 columns in a file or a log."""
     from rich.console import Console

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 import jax
 import numpy as np
 
-from jaxtrack.cli import parse, run
+from jaxtrack.cli import parse, require_integer, run
 from jaxtrack.policies import POLICIES
 from jaxtrack.recording import Episode, record_episode
 from jaxtrack.scene import Scene
@@ -167,8 +167,7 @@ def check(options: Options) -> None:
     if options.policy not in POLICIES:
         raise ValueError(f"policy = {options.policy!r}: expected one of {', '.join(POLICIES)}")
     for name, low in (("seed", 0), ("steps", 1), ("fps", 1), ("stride", 0)):
-        if getattr(options, name) < low:
-            raise ValueError(f"{name} = {getattr(options, name)}: expected an integer >= {low}")
+        require_integer(name, getattr(options, name), low)
     out = options.out
     if out.suffix not in SUFFIXES:
         raise ValueError(f"out = {str(out)!r}: expected a name that ends in {', '.join(SUFFIXES)}")

@@ -26,7 +26,7 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
-from jaxtrack.cli import parse, run, take_config
+from jaxtrack.cli import parse, require_file, run, take_config
 from jaxtrack.detection_file import RecordedDetections, read_detections
 from jaxtrack.params import Params, StaticParams, validate
 from jaxtrack.track_file import TrackWriter, partial_path
@@ -171,8 +171,7 @@ def check_files(options: Options) -> None:
     for name, path in (("out", options.out), ("plot", options.plot)):
         if path is None:
             continue
-        if path.is_dir() or not path.parent.is_dir():
-            raise ValueError(f"{name} = {str(path)!r}: expected a file in a folder that exists")
+        require_file(name, path)
         for other, known in taken:
             if known in (path.resolve(), partial_path(path).resolve()):
                 raise ValueError(f"{name} = {str(path)!r}: is the file of {other}, which would be lost")

@@ -5,7 +5,7 @@ import json
 
 import pytest
 
-from jaxtrack.cli import BAD_USAGE, INTERRUPTED, parse, run, take_config
+from jaxtrack.cli import BAD_USAGE, INTERRUPTED, parse, require_file, require_integer, run, take_config
 
 
 @dataclasses.dataclass(frozen=True)
@@ -131,6 +131,22 @@ def test_a_file_that_is_no_text_is_named(tmp_path):
 
 def test_config_without_a_file_name_is_refused():
     assert refusal(["--config"]).startswith("config: expected the name of a .toml or .json file")
+
+
+def test_an_integer_that_is_too_small_is_named():
+    require_integer("num_envs", 1, 1)
+    with pytest.raises(ValueError, match="num_envs = 0: expected an integer >= 1"):
+        require_integer("num_envs", 0, 1)
+
+
+def test_a_place_where_no_file_can_be_written_is_named(tmp_path):
+    require_file("out", tmp_path / "new.csv")
+    (tmp_path / "old.csv").touch()
+    require_file("out", tmp_path / "old.csv")
+    for path in (tmp_path, tmp_path / "missing" / "new.csv"):
+        with pytest.raises(ValueError, match="expected a file in a folder that exists") as caught:
+            require_file("out", path)
+        assert str(caught.value).startswith(f"out = {str(path)!r}: ")
 
 
 def exit_code(monkeypatch, command, *argv):

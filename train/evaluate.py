@@ -19,7 +19,7 @@ from rich.progress import (
 )
 from rich.text import Text
 
-from jaxtrack.cli import parse, run, wide_console
+from jaxtrack.cli import parse, require_integer, run, wide_console
 from jaxtrack.env import SearchTrack
 from jaxtrack.params import Params, StaticParams
 from jaxtrack.policies import POLICIES
@@ -90,8 +90,7 @@ def main(argv: Sequence[str]) -> int:
 def check(options: EvaluateOptions) -> None:
     """Raises ValueError, in one line, for options that make no sense."""
     for name, low in (("episodes", 1), ("seed", 0)):
-        if getattr(options, name) < low:
-            raise ValueError(f"{name} = {getattr(options, name)}: expected an integer >= {low}")
+        require_integer(name, getattr(options, name), low)
     for name in options.policies:
         if name != ALL and name not in POLICIES:
             raise ValueError(f"policies = {name!r}: expected {ALL}, or some of {', '.join(POLICIES)}")

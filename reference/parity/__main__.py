@@ -13,7 +13,7 @@ import jax
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from jaxtrack.cli import parse, run, wide_console
+from jaxtrack.cli import parse, require_file, require_integer, run, wide_console
 from jaxtrack.report import circumstances
 from reference.parity.environment import environment_rows
 from reference.parity.free_running import free_running_rows
@@ -73,13 +73,10 @@ QUICK: dict[str, Any] = {
 def check(options: ParityOptions) -> None:
     """Raises ValueError, naming the option, before anything is computed."""
     for name in QUICK:
-        if getattr(options, name) < 1:
-            raise ValueError(f"{name} = {getattr(options, name)}: expected an integer >= 1")
+        require_integer(name, getattr(options, name), 1)
     for name in ("seed", "processes"):
-        if getattr(options, name) < 0:
-            raise ValueError(f"{name} = {getattr(options, name)}: expected an integer >= 0")
-    if options.out.is_dir() or not options.out.parent.is_dir():
-        raise ValueError(f"out = {str(options.out)!r}: expected a file in a folder that exists")
+        require_integer(name, getattr(options, name), 0)
+    require_file("out", options.out)
     if options.readme is not None and not options.readme.is_file():
         raise ValueError(f"readme = {str(options.readme)!r}: no such file")
 
