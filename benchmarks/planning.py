@@ -12,6 +12,7 @@ import jax
 import numpy as np
 from rich.progress import Progress
 
+from benchmarks.playing import first, raster
 from jaxtrack import policies
 from jaxtrack.cli import parse, require_file, require_integer, run, wide_console
 from jaxtrack.env import EnvState, make
@@ -87,24 +88,8 @@ def managers(options: PlanningOptions) -> dict[str, policies.PolicyBuilder]:
 def scenes(static: StaticParams, params: Params, count: int, seed: int) -> EnvState:
     """States `[count]` after one raster over the field, so that tracks exist."""
     env, params = make(params, static)
-
-    def scan_field(key: jax.Array, params: Params) -> EnvState:
-        key_reset, key_steps = jax.random.split(key)
-        policy = policies.coverage(static, params)
-
-        def one_step(state: EnvState, key: jax.Array) -> tuple[EnvState, None]:
-            return env.advance(state, policy(key, state), env.sample_noise(key), params)[0], None
-
-        start = env.reset_env(key_reset, params)[1]
-        return jax.lax.scan(one_step, start, jax.random.split(key_steps, static.num_looks**2))[0]
-
-    keys = jax.random.split(jax.random.key(seed), count)
-    return jax.block_until_ready(jax.jit(jax.vmap(scan_field, in_axes=(0, None)))(keys, params))
-
-
-def first(count: int, states: EnvState) -> EnvState:
-    """The first `count` states."""
-    return jax.block_until_ready(jax.tree.map(lambda leaf: leaf[:count], states))
+    scan_field = jax.jit(lambda key, params: raster(key, params, env, count)[1])
+    return jax.block_until_ready(scan_field(jax.random.key(seed), params))
 
 
 def compile_policy(

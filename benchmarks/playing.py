@@ -1,7 +1,7 @@
 """Our side of the benchmarks: many environments stepped together, through gymnax's `step`."""
 
 import time
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -11,6 +11,7 @@ from jaxtrack.env import EnvState, SearchTrack
 from jaxtrack.observation import Observation
 from jaxtrack.params import Params, StaticParams
 
+Tree = TypeVar("Tree")
 Start = tuple[Observation, EnvState]
 """Observation and state of environments `[B]`, from which a piece of an episode is played."""
 
@@ -77,6 +78,6 @@ def compile_play(
     return compiled, seconds
 
 
-def first(count: int, start: Start) -> Start:
+def first(count: int, tree: Tree) -> Tree:
     """The first `count` environments."""
-    return jax.block_until_ready(jax.tree.map(lambda leaf: leaf[:count], start))
+    return jax.block_until_ready(jax.tree.map(lambda leaf: leaf[:count], tree))
