@@ -20,6 +20,7 @@ from jaxtrack.params import Params
 from jaxtrack.report import circumstances, print_table
 from jaxtrack.track import Options, track_file
 from jaxtrack.tracking import TrackRows, track_scans
+from reference.components import noise_sigmas
 from reference.parity.compare import TOLERANCE, covariance_error, mean_error
 from reference.pipeline import StepRecord, StoneSoupTracker
 from reference.translate import TrackKey
@@ -67,7 +68,7 @@ def synthetic_scans(targets: int, seed: int) -> Iterator[np.ndarray]:
         direction / np.linalg.norm(direction, axis=1, keepdims=True) * rng.uniform(3e3, 1e4, (targets, 1))
     )
     radius, speed = rng.uniform(300, 1500, targets), rng.uniform(10, 50, targets)
-    sigmas = [PARAMS.elevation_sigma, PARAMS.bearing_sigma, PARAMS.range_sigma]
+    sigmas = noise_sigmas(PARAMS)
     scan = 0
     while True:
         angle = speed / radius * INTERVAL * scan

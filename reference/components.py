@@ -140,9 +140,14 @@ def measurement_model(params: Params, exact_jacobian: bool = True) -> CartesianT
     return kind(ndim_state=STATE_DIM, mapping=POSITION, noise_covar=noise_covariance(params))
 
 
+def noise_sigmas(params: Params) -> np.ndarray:
+    """Standard deviations `[3]` of the measurement noise (rad, rad, m)."""
+    return np.array([params.elevation_sigma, params.bearing_sigma, params.range_sigma])
+
+
 def noise_covariance(params: Params) -> np.ndarray:
     """Measurement noise covariance R `[3, 3]` (rad^2, rad^2, m^2)."""
-    return np.diag([params.elevation_sigma, params.bearing_sigma, params.range_sigma]) ** 2
+    return np.diag(noise_sigmas(params)) ** 2
 
 
 def prior_state(params: Params) -> GaussianState:

@@ -12,6 +12,7 @@ from jaxtrack.models import elevation_bearing_range, wrap_detection
 from jaxtrack.params import Params
 from jaxtrack.trajectories import Recording
 from jaxtrack.types import NO_TRUTH, Detections
+from reference.components import noise_sigmas
 
 
 def scan_interval(recording: Recording) -> float:
@@ -38,8 +39,8 @@ def observe_aircraft(
     rng = np.random.default_rng(seed)
     states = recording.states[:scans]
     truth = np.asarray(elevation_bearing_range(jnp.asarray(states)))
-    sigma = np.array([params.elevation_sigma, params.bearing_sigma, params.range_sigma])
-    value = np.asarray(wrap_detection(jnp.asarray(truth + sigma * rng.standard_normal(truth.shape))))
+    noise = noise_sigmas(params) * rng.standard_normal(truth.shape)
+    value = np.asarray(wrap_detection(jnp.asarray(truth + noise)))
     present = np.isfinite(states).all(axis=-1)
     present &= rng.random(present.shape) < params.detection_probability
     low, high = np.nanmin(truth, axis=(0, 1)), np.nanmax(truth, axis=(0, 1))

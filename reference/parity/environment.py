@@ -13,9 +13,10 @@ from jaxtrack import models
 from jaxtrack.env import EnvState, SearchTrack, StepNoise
 from jaxtrack.params import REWARDS, Params, StaticParams
 from jaxtrack.reward import reward_terms
+from jaxtrack.sensor import look_indices
 from jaxtrack.truth import newborn_states, num_births
 from jaxtrack.types import Truths
-from reference.components import step_duration, transition_model
+from reference.components import noise_sigmas, step_duration, transition_model
 from reference.gym_env import StoneSoupEnv
 from reference.parity.compare import TOLERANCE
 from reference.parity.episodes import Divergence
@@ -58,8 +59,7 @@ class Played:
 def pointing_or_random(key: jax.Array, state: EnvState, env: SearchTrack, params: Params) -> jax.Array:
     """Half of the looks at one of three truths, half anywhere: updates, births and deletions."""
     elevation, azimuth, _ = models.elevation_bearing_range(state.truths.state[(state.time // 10) % 3])
-    last = env.static.num_looks - 1
-    there = jnp.round((jnp.stack([azimuth, elevation]) / params.field_limit + 1) / 2 * last).astype(int)
+    there = look_indices(jnp.stack([azimuth, elevation]), env.static, params)
     anywhere = jax.random.randint(key, (2,), 0, env.static.num_looks)
     return jnp.where(state.time % 2 == 0, anywhere, there)
 
@@ -100,14 +100,13 @@ def draws_of(played: Played, params: Params) -> Draws:
     with jax.enable_x64(True):
         births = jax.vmap(num_births, in_axes=(0, None))(noise, params)
         newborn = jax.vmap(newborn_states, in_axes=(0, None))(noise, params)
-    sigma = np.array([params.elevation_sigma, params.bearing_sigma, params.range_sigma])
     return Draws(
         initial=np.asarray(played.initial.state)[np.asarray(played.initial.alive)],
         motion=(noise.motion @ factor.T).reshape(*shape[:2], 6),
         death=noise.death,
         births=np.asarray(births),
         newborn=np.asarray(newborn),
-        detection=sigma * played.noise.sensor.detection,
+        detection=noise_sigmas(params) * played.noise.sensor.detection,
     )
 
 

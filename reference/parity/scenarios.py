@@ -12,6 +12,7 @@ import numpy as np
 from jaxtrack.models import constant_velocity
 from jaxtrack.params import Params
 from jaxtrack.types import NO_TRUTH, Detections, Truths
+from reference.components import noise_sigmas
 from reference.parity.scenes import unit_vectors
 
 KINDS = ("field", "wrap", "overhead", "around", "crowded")
@@ -116,7 +117,7 @@ def random_detections(
     value: Any = np.zeros((steps, MAX_DETECTIONS, 3))
     truth: Any = np.full((steps, MAX_DETECTIONS), NO_TRUTH)
     active: Any = np.zeros((steps, MAX_DETECTIONS), dtype=bool)
-    sigma = np.array([params.elevation_sigma, params.bearing_sigma, params.range_sigma])
+    sigma = noise_sigmas(params)
     looked_at = rng.uniform(0.3, 1)  # share of the steps in which anything is looked at
     for step in range(steps):
         if rng.random() > looked_at:
@@ -137,8 +138,7 @@ def random_clutter(rng: np.random.Generator, state: np.ndarray, params: Params) 
     """False detections `[C, 3]`: half a few sigmas from a truth, half in any direction."""
     count = rng.poisson(params.clutter_rate)
     near = spherical(state[rng.integers(0, len(state), count), 0::2])
-    sigma = np.array([params.elevation_sigma, params.bearing_sigma, params.range_sigma])
-    near += 6 * sigma * rng.standard_normal((count, 3))
+    near += 6 * noise_sigmas(params) * rng.standard_normal((count, 3))
     far = np.stack(
         [
             rng.uniform(-1.5, 1.5, count),

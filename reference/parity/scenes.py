@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxtrack import NO_DETECTION, Detections, Params, Tracks
-from reference.components import noise_covariance
+from reference.components import noise_sigmas
 
 Direction = tuple[float, float]
 
@@ -87,8 +87,7 @@ def detections_near(
     value = np.stack(
         [np.arcsin(points[:, 2] / distance), np.arctan2(points[:, 1], points[:, 0]), distance], axis=1
     )
-    noise = np.sqrt(np.diag(noise_covariance(params)))
-    return value + noise * rng.standard_normal((count, 3))
+    return value + noise_sigmas(params) * rng.standard_normal((count, 3))
 
 
 def padded(value: np.ndarray, capacity: int) -> Detections:
