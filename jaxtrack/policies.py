@@ -19,7 +19,7 @@ import jax.numpy as jnp
 from jaxtrack.models import elevation_bearing_range
 from jaxtrack.params import Params, StaticParams
 from jaxtrack.scan_map import beam_weights, look_grid
-from jaxtrack.sensor import in_beam
+from jaxtrack.sensor import in_beam, look_indices
 from jaxtrack.types import Tracks, position
 
 if TYPE_CHECKING:
@@ -155,9 +155,7 @@ def to_action(index: jax.Array, static: StaticParams, params: Params) -> jax.Arr
 def nearest_look(mean: jax.Array, static: StaticParams, params: Params) -> jax.Array:
     """Index of the discrete look nearest in angle to a track's mean `[6]`."""
     elevation, azimuth, _ = elevation_bearing_range(mean)
-    last = static.num_looks - 1
-    cells = jnp.round((jnp.stack([azimuth, elevation]) / params.field_limit + 1) / 2 * last)
-    azimuth_index, elevation_index = jnp.clip(cells, 0, last).astype(int)
+    azimuth_index, elevation_index = look_indices(jnp.stack([azimuth, elevation]), static, params)
     return azimuth_index * static.num_looks + elevation_index
 
 

@@ -57,6 +57,12 @@ def look_angles(action: jax.Array, static: StaticParams, params: Params) -> jax.
     return params.field_limit * (2 * index / last - 1)
 
 
+def look_indices(angles: jax.Array, static: StaticParams, params: Params) -> jax.Array:
+    """Indices `[..., 2]` of the discrete look nearest to angles `[..., 2]` (azimuth, elevation in rad)."""
+    last = static.num_looks - 1
+    return jnp.clip(jnp.round((angles / params.field_limit + 1) / 2 * last), 0, last).astype(int)
+
+
 def boresight_frame(points: jax.Array, look: jax.Array) -> jax.Array:
     """Points `[..., 3]` turned so that the look `[2]` lies along x."""
     cos_az, sin_az = jnp.cos(look[0]), jnp.sin(look[0])

@@ -56,6 +56,17 @@ def test_continuous_looks_are_angles_kept_within_the_field(params):
     np.testing.assert_allclose(sensor.look_angles(actions, static, params), expected, rtol=1e-6)
 
 
+def test_the_look_of_an_angle_is_the_nearest_one(params):
+    static = StaticParams()
+    every = jnp.stack(jnp.meshgrid(jnp.arange(19), jnp.arange(19)), axis=-1)
+    angles = sensor.look_angles(every, static, params)
+    near = 0.49 * (2 * LIMIT / 18)
+    for shift in (0.0, near, -near):
+        np.testing.assert_array_equal(sensor.look_indices(angles + shift, static, params), every)
+    beyond = jnp.array([[-90, 90], [0, 120]]) * DEGREE
+    np.testing.assert_array_equal(sensor.look_indices(beyond, static, params), [[0, 18], [9, 18]])
+
+
 def test_a_nan_angle_looks_nowhere(params):
     static = StaticParams(continuous_actions=True)
     look = sensor.look_angles(jnp.array([jnp.nan, 0.0]), static, params)

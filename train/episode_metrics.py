@@ -12,6 +12,7 @@ from jaxtrack.env import EnvState, SearchTrack, StepRecord
 from jaxtrack.kalman import inverse_3x3
 from jaxtrack.params import Params, StaticParams
 from jaxtrack.reward import reward_terms
+from jaxtrack.sensor import look_indices
 from jaxtrack.siap import siap
 from jaxtrack.types import STATE_DIM, Tracks, Truths, position, velocity
 
@@ -167,8 +168,7 @@ def nees(error: jax.Array, covariance: jax.Array) -> jax.Array:
 
 def look_number(look: jax.Array, static: StaticParams, params: Params) -> jax.Array:
     """Number of the discrete look nearest in angle to a boresight `[2]` (rad)."""
-    last = static.num_looks - 1
-    azimuth, elevation = jnp.round((look / params.field_limit + 1) / 2 * last).astype(int)
+    azimuth, elevation = look_indices(look, static, params)
     return azimuth * static.num_looks + elevation
 
 
