@@ -22,6 +22,7 @@ from jaxtrack.track import Options, track_file
 from jaxtrack.tracking import TrackRows, track_scans
 from reference.components import noise_sigmas
 from reference.parity.compare import TOLERANCE, covariance_error, mean_error
+from reference.parity.scenes import spherical
 from reference.pipeline import StepRecord, StoneSoupTracker
 from reference.translate import TrackKey
 
@@ -72,11 +73,9 @@ def synthetic_scans(targets: int, seed: int) -> Iterator[np.ndarray]:
     scan = 0
     while True:
         angle = speed / radius * INTERVAL * scan
-        x, y, z = centre.T + radius * np.stack([np.cos(angle), np.sin(angle), np.zeros(targets)])
-        seen = np.stack(
-            [np.arctan2(z, np.hypot(x, y)), np.arctan2(y, x), np.sqrt(x**2 + y**2 + z**2)], axis=1
-        )
-        seen = (seen + sigmas * rng.standard_normal((targets, 3)))[rng.random(targets) < DETECTED]
+        circle = radius * np.stack([np.cos(angle), np.sin(angle), np.zeros(targets)])
+        seen = spherical(centre + circle.T) + sigmas * rng.standard_normal((targets, 3))
+        seen = seen[rng.random(targets) < DETECTED]
         count = rng.poisson(CLUTTER)
         elevation = np.arcsin(rng.uniform(-1, 1, count))
         clutter = [elevation, rng.uniform(-np.pi, np.pi, count), rng.uniform(1e3, 1.1e4, count)]

@@ -27,8 +27,8 @@ from reference.components import (
 )
 from reference.parity.ours import on_device
 from reference.parity.rows import Row
-from reference.parity.scenarios import random_params, spherical, wrapped
-from reference.parity.scenes import random_covariances, random_means, track_list, unit_vectors
+from reference.parity.scenarios import random_params, wrapped
+from reference.parity.scenes import random_covariances, random_means, spherical, track_list, unit_vectors
 from reference.radar import build_radar, steer
 from reference.translate import as_vector, to_detections
 

@@ -13,7 +13,7 @@ from jaxtrack.models import constant_velocity
 from jaxtrack.params import Params
 from jaxtrack.types import NO_TRUTH, Detections, Truths
 from reference.components import noise_sigmas
-from reference.parity.scenes import unit_vectors
+from reference.parity.scenes import spherical, unit_vectors
 
 KINDS = ("field", "wrap", "overhead", "around", "crowded")
 """In the field, across the seam of bearings, across the zenith, everywhere, and all in one place."""
@@ -148,12 +148,6 @@ def random_clutter(rng: np.random.Generator, state: np.ndarray, params: Params) 
         axis=1,
     )
     return np.where(rng.random((count, 1)) < 0.5, near, far)
-
-
-def spherical(points: np.ndarray) -> np.ndarray:
-    """Elevation, bearing (rad), range (m) `[..., 3]` of positions `[..., 3]` (m)."""
-    x, y, z = np.moveaxis(points, -1, 0)
-    return np.stack([np.arctan2(z, np.hypot(x, y)), np.arctan2(y, x), np.linalg.norm(points, axis=-1)], -1)
 
 
 def wrapped(value: np.ndarray) -> np.ndarray:

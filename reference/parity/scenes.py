@@ -20,6 +20,12 @@ def unit_vectors(azimuth: np.ndarray, elevation: np.ndarray) -> np.ndarray:
     )
 
 
+def spherical(points: np.ndarray) -> np.ndarray:
+    """Elevation, bearing (rad), range (m) `[..., 3]` of positions `[..., 3]` (m)."""
+    x, y, z = np.moveaxis(points, -1, 0)
+    return np.stack([np.arctan2(z, np.hypot(x, y)), np.arctan2(y, x), np.linalg.norm(points, axis=-1)], -1)
+
+
 def random_means(
     rng: np.random.Generator,
     count: int,
@@ -82,11 +88,7 @@ def detections_near(
     chosen = rng.choice(live, count)
     mean, covariance = np.asarray(tracks.mean)[chosen], np.asarray(tracks.covariance)[chosen]
     shaken = np.linalg.cholesky(covariance) @ rng.standard_normal((count, 6, 1)) * sigmas
-    points = (mean + shaken[..., 0])[:, 0::2]
-    distance = np.linalg.norm(points, axis=1)
-    value = np.stack(
-        [np.arcsin(points[:, 2] / distance), np.arctan2(points[:, 1], points[:, 0]), distance], axis=1
-    )
+    value = spherical((mean + shaken[..., 0])[:, 0::2])
     return value + noise_sigmas(params) * rng.standard_normal((count, 3))
 
 

@@ -13,7 +13,7 @@ from jaxtrack.models import constant_velocity
 from reference.components import noise_covariance
 from reference.opensky import Options, tracker_params
 from reference.parity.compare import covariance_error, mean_error
-from reference.parity.scenes import padded, track_list, unit_vectors
+from reference.parity.scenes import padded, spherical, track_list, unit_vectors
 from reference.pipeline import StoneSoupTracker
 
 LONG = np.longdouble
@@ -66,9 +66,7 @@ def test_stone_soup_rounds_more_than_we_do():
     mean = np.zeros((12, 6))
     mean[:, 0::2] = places
     covariance = np.broadcast_to(np.diag([150.0**2, 200.0**2] * 3), (12, 6, 6)).copy()
-    distance = np.linalg.norm(places, axis=1)
-    angles = np.arcsin(places[:, 2] / distance), np.arctan2(places[:, 1], places[:, 0])
-    detections = np.stack([*angles, distance], axis=1) + rng.normal(0, [0.003, 0.003, 500.0], (12, 3))
+    detections = spherical(places) + rng.normal(0, [0.003, 0.003, 500.0], (12, 3))
 
     largest = {"ours": 0.0, "theirs": 0.0}
     step = jax.jit(tracker.step)

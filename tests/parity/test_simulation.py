@@ -12,6 +12,7 @@ from jaxtrack.sensor import look_angles
 from reference import observation as observation_module
 from reference.components import EPOCH
 from reference.observation import TrackSlots
+from reference.parity.scenes import spherical
 from reference.radar import build_radar
 from reference.reward import track_term
 from reference.simulation import StoneSoupScenario
@@ -97,18 +98,13 @@ def test_episode_ends():
 
 def test_truths_start_in_the_field(params):
     states = initial_states(np.random.default_rng(0), 4000, params)
-    azimuth, elevation, distance = cart2sphere_of(states)
+    elevation, azimuth, distance = spherical(states[:, 0::2]).T
     for angle in (azimuth, elevation):
         assert 0.99 * params.field_limit < np.abs(angle).max() <= params.field_limit
         np.testing.assert_allclose(angle.std(), params.field_limit / np.sqrt(3), rtol=0.05)
     assert params.min_range <= distance.min() < 1.02 * params.min_range
     assert 0.99 * params.max_range < distance.max() <= params.max_range
     np.testing.assert_allclose(states[:, 1::2].std(axis=0), params.truth_velocity_sigma, rtol=0.05)
-
-
-def cart2sphere_of(states):
-    x, y, z = states[:, 0::2].T
-    return np.arctan2(y, x), np.arctan2(z, np.hypot(x, y)), np.sqrt(x**2 + y**2 + z**2)
 
 
 def test_truths_of_its_own_are_born_die_and_move_as_asked():

@@ -9,7 +9,7 @@ import pytest
 from jaxtrack import NO_DETECTION, Params, track
 from jaxtrack.track_file import UPPER
 from reference.parity.compare import TOLERANCE, covariance_error, mean_error
-from reference.parity.scenes import unit_vectors
+from reference.parity.scenes import spherical, unit_vectors
 from reference.pipeline import StoneSoupTracker
 
 SETTINGS = {"process_noise": 20.0, "deletion_threshold": 4000.0, "gate_threshold": 4.0, "range_sigma": 8.0}
@@ -32,10 +32,7 @@ def write_recording(path, seed=0):
         lines.append(f",,{time!r},")
         if scan % 9 == 5:
             continue
-        x, y, z = (position + velocity * (time - START)).T[:, rng.random(7) < 0.8]
-        seen = np.stack(
-            [np.arctan2(z, np.hypot(x, y)), np.arctan2(y, x), np.sqrt(x**2 + y**2 + z**2)], axis=1
-        )
+        seen = spherical((position + velocity * (time - START))[rng.random(7) < 0.8])
         seen += [2e-3, 2e-3, 8.0] * rng.standard_normal(seen.shape)
         clutter = rng.uniform([-0.5, 2.0, 500], [1.5, 4.0, 6000], (rng.poisson(0.7), 3))
         rows = np.concatenate([seen, clutter]).tolist()
