@@ -233,11 +233,15 @@ def _check_initial_truths(static: StaticParams, params: Params) -> None:
         )
 
 
+def allowed_range(field: dataclasses.Field) -> str:
+    """Range of a number of `Params` in words, such as (0, inf): a square bracket includes the end."""
+    low, high = field.metadata["low"], field.metadata["high"]
+    return f"{'(' if field.metadata['open_low'] else '['}{low:g}, {high:g}{')' if math.isinf(high) else ']'}"
+
+
 def _check_quantity(field: dataclasses.Field, value: Any) -> None:
     low, high = field.metadata["low"], field.metadata["high"]
-    bracket = "(" if field.metadata["open_low"] else "["
-    end = ")" if math.isinf(high) else "]"
-    expected = f"expected a number in {bracket}{low:g}, {high:g}{end} {field.metadata['unit']}"
+    expected = f"expected a number in {allowed_range(field)} {field.metadata['unit']}"
     try:
         numbers = np.asarray(value, dtype=float)
     except (TypeError, ValueError):

@@ -7,7 +7,6 @@ As a function: `jaxtrack.tracking.track_scans`.
 
 import contextlib
 import dataclasses
-import math
 import sys
 import time
 from collections.abc import Sequence
@@ -28,7 +27,7 @@ from rich.progress import (
 
 from jaxtrack.cli import parse, require_file, run, take_config
 from jaxtrack.detection_file import RecordedDetections, read_detections
-from jaxtrack.params import Params, StaticParams, validate
+from jaxtrack.params import Params, StaticParams, allowed_range, validate
 from jaxtrack.track_file import TrackWriter, partial_path
 from jaxtrack.track_plot import SUFFIXES, TrackPaths
 from jaxtrack.tracking import track_scans
@@ -185,11 +184,8 @@ def help_text() -> str:
     lines = [HELP]
     for field in dataclasses.fields(Params):
         if field.name in TRACKER_FIELDS:
-            low, high = field.metadata["low"], field.metadata["high"]
-            bracket = "(" if field.metadata["open_low"] else "["
-            end = ")" if math.isinf(high) else "]"
             unit = "" if field.metadata["unit"] == "1" else f" {field.metadata['unit']}"
-            lines.append(f"  {field.name} = {field.default:g}{unit}, in {bracket}{low:g}, {high:g}{end}")
+            lines.append(f"  {field.name} = {field.default:g}{unit}, in {allowed_range(field)}")
     return "\n".join(lines)
 
 
