@@ -18,6 +18,7 @@ from stonesoup.measures.state import (
     SquaredGaussianHellinger,
     SquaredMahalanobis,
 )
+from stonesoup.metricgenerator.ospametric import GOSPAMetric
 from stonesoup.models.measurement.nonlinear import CartesianToElevationBearingRange
 from stonesoup.models.transition.linear import CombinedLinearGaussianTransitionModel, ConstantVelocity
 from stonesoup.predictor.kalman import KalmanPredictor
@@ -148,6 +149,16 @@ def noise_sigmas(params: Params) -> np.ndarray:
 def noise_covariance(params: Params) -> np.ndarray:
     """Measurement noise covariance R `[3, 3]` (rad^2, rad^2, m^2)."""
     return np.diag(noise_sigmas(params)) ** 2
+
+
+def gospa_metric(params: Params) -> GOSPAMetric:
+    """GOSPA of positions (m)."""
+    return GOSPAMetric(
+        p=params.gospa_order,
+        c=params.gospa_cutoff,
+        switching_penalty=params.gospa_switching_penalty,
+        measure=Euclidean(POSITION),
+    )
 
 
 def prior_state(params: Params) -> GaussianState:

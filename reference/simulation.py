@@ -8,8 +8,6 @@ reward are numpy.
 from collections.abc import Iterator
 
 import numpy as np
-from stonesoup.measures import Euclidean
-from stonesoup.metricgenerator.ospametric import GOSPAMetric
 from stonesoup.metricgenerator.uncertaintymetric import SumofCovarianceNormsMetric
 from stonesoup.types.array import StateVector
 from stonesoup.types.detection import Detection
@@ -17,8 +15,7 @@ from stonesoup.types.groundtruth import GroundTruthPath
 from stonesoup.types.track import Track
 
 from jaxtrack.params import Params, StaticParams
-from jaxtrack.types import POSITION
-from reference.components import build_components, time_of
+from reference.components import build_components, gospa_metric, time_of
 from reference.observation import ScanMap, TrackSlots, track_observation
 from reference.radar import build_radar, steer
 from reference.reward import snapshot, track_term
@@ -52,6 +49,7 @@ class StoneSoupScenario:
         self.params = params
         self.exact_jacobian = exact_jacobian
         self.uncertainty = SumofCovarianceNormsMetric()
+        self.gospa_metric = gospa_metric(params)
 
     def reset(self, seed: int = 0, draws: Draws | None = None) -> Observation:
         """New truths, no tracks, a field never seen.
@@ -146,11 +144,8 @@ class StoneSoupScenario:
 
     def gospa(self) -> float:
         """Stone Soup's GOSPA distance (m) of the live tracks, positions only."""
-        generator = GOSPAMetric(
-            p=self.params.gospa_order, c=self.params.gospa_cutoff, measure=Euclidean(POSITION)
-        )
         states = [track.state for track in self.tracks]
-        found = generator.compute_gospa_metric(states, [path[-1] for path in self.paths])[0].value
+        found = self.gospa_metric.compute_gospa_metric(states, [path[-1] for path in self.paths])[0].value
         return float(found["distance"])
 
     def _move_truths(self) -> None:

@@ -13,7 +13,6 @@ from stonesoup.measures import Euclidean
 from stonesoup.metricgenerator.base import MetricGenerator
 from stonesoup.metricgenerator.basicmetrics import BasicMetrics
 from stonesoup.metricgenerator.manager import MultiManager
-from stonesoup.metricgenerator.ospametric import GOSPAMetric
 from stonesoup.metricgenerator.pcrbmetric import PCRBMetric
 from stonesoup.metricgenerator.tracktotruthmetrics import SIAPMetrics
 from stonesoup.metricgenerator.uncertaintymetric import (
@@ -30,6 +29,7 @@ from jaxtrack.types import POSITION, STATE_DIM, VELOCITY
 from reference.components import (
     ExactCartesianToElevationBearingRange,
     build_components,
+    gospa_metric,
     time_of,
     transition_model,
 )
@@ -102,14 +102,7 @@ def stock_norms(stock: StockRecord) -> Numbers:
 
 def stock_gospa(stock: StockRecord) -> Numbers:
     """GOSPA and its parts `[K]`, with the switching penalty of the parameters."""
-    params = stock.record.params
-    generator = GOSPAMetric(
-        p=params.gospa_order,
-        c=params.gospa_cutoff,
-        switching_penalty=params.gospa_switching_penalty,
-        measure=Euclidean(POSITION),
-    )
-    metric = stock.only_metric(generator)
+    metric = stock.only_metric(gospa_metric(stock.record.params))
     # One step alone comes as it is, more as a list.
     singles = metric.value if isinstance(metric.value, list) else [metric]
     return {part: stock.by_step(singles, part) for part in GOSPA_PARTS}
