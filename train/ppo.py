@@ -19,7 +19,6 @@ from rich.table import Table
 from jaxtrack.cli import INTERRUPTED, parse, run, take_config, wide_console
 from jaxtrack.env import SearchTrack, make
 from train import learner
-from train.agents import agent_policy
 from train.checkpoint import open_manager, save, write_config
 from train.config import TrainConfig, check, from_dict, to_dict
 from train.evaluate import COMPARED_SEED, agent, compare_with_baselines
@@ -207,8 +206,8 @@ def finish(
     console.print(f"evaluated in {time.perf_counter() - started:.1f} s")
     plots.learning_curve(folder / "metrics.csv", folder / "learning_curve.png")
     drawn = figures.draw_all(comparison.played, summary, config.params, folder)
-    built = agent_policy(config.encoder, state.weights)(env.static, config.params)
-    episode = record_episode(env, config.params, built, jax.random.key(COMPARED_SEED))
+    policy = competitor.build(state.weights)(env.static, config.params)
+    episode = record_episode(env, config.params, policy, jax.random.key(COMPARED_SEED))
     animate(episode, folder / "episode.gif", progress=console.is_terminal)
     pictures = ["learning_curve.png", *(path.name for path in drawn.values()), "episode.gif"]
     console.print(f"results.json, episodes.csv, curves.npz, {', '.join(pictures)} in {folder}")
