@@ -7,13 +7,12 @@ from collections.abc import Iterable
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
-from jaxtrack import tracker
 from jaxtrack.params import Params
-from jaxtrack.types import NO_DETECTION, NO_TRUTH, Detections, Tracks
+from jaxtrack.types import NO_DETECTION, NO_TRUTH, Detections
 from reference.parity.episodes import to_records
+from reference.parity.ours import track_detections
 from reference.pipeline import StepRecord, StoneSoupTracker
 from reference.translate import TrackKey
 
@@ -35,22 +34,13 @@ class Run:
 
 def run_jaxtrack(detections: Detections, params: Params) -> Run:
     """Our tracker on detections `[K, D]`; track slots are doubled until nothing is dropped."""
-
-    @jax.jit
-    def play(detections: Detections, tracks: Tracks) -> Any:
-        def one_scan(carry: tuple[Tracks, jax.Array], now: Detections) -> Any:
-            tracks, info = tracker.step(carry[0], now, params.time_step, carry[1], params)
-            return (tracks, carry[1] + 1), (tracks, info)
-
-        return jax.lax.scan(one_scan, (tracks, jnp.asarray(1)), detections)[1]
-
     slots = detections.active.shape[1]
     while True:
         slots *= 2
         started = time.perf_counter()
-        played = play.lower(detections, Tracks.empty(slots)).compile()
+        played = track_detections.lower(detections, params, slots).compile()
         compiled = time.perf_counter()
-        after, info = jax.device_get(jax.block_until_ready(played(detections, Tracks.empty(slots))))
+        after, info = jax.device_get(jax.block_until_ready(played(detections, params)))
         seconds = time.perf_counter() - compiled
         if not info.num_dropped.any():
             return Run(to_records(after, info, len(info.num_dropped)), seconds, compiled - started)

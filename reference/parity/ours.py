@@ -1,5 +1,6 @@
 """Our tracker on the same scenarios: every step from the oracle's state, and free-running."""
 
+from functools import partial
 from typing import Any, TypeVar
 
 import jax
@@ -32,7 +33,8 @@ def steps_from(before: Tracks, scenario: Scenario, double: bool = True) -> tuple
 
 def episode(scenario: Scenario, double: bool = True) -> tuple[Tracks, TrackerInfo]:
     """The whole scenario from an empty track list; `[K]` results on the host."""
-    return on_device(_episode, double, scenario.detections, scenario.params)
+    play = partial(track_detections, max_tracks=MAX_TRACKS)
+    return on_device(play, double, scenario.detections, scenario.params)
 
 
 def on_device(function: Any, double: bool, *arguments: Any) -> Any:
@@ -62,12 +64,14 @@ def _steps_from(
     return jax.vmap(one)(before, detections, index)
 
 
-@jax.jit
-def _episode(detections: Detections, params: Params) -> tuple[Tracks, TrackerInfo]:
+@partial(jax.jit, static_argnames="max_tracks")
+def track_detections(detections: Detections, params: Params, max_tracks: int) -> tuple[Tracks, TrackerInfo]:
+    """The tracker on detections `[K, D]` from an empty list of `max_tracks` slots; results `[K]`."""
+
     def one(carry: tuple[Tracks, jax.Array], scan: Detections) -> tuple[Any, Any]:
         tracks, index = carry
         tracks, info = tracker.step(tracks, scan, params.time_step, index, params)
         return (tracks, index + 1), (tracks, info)
 
-    start = Tracks.empty(MAX_TRACKS), jnp.asarray(1)
+    start = Tracks.empty(max_tracks), jnp.asarray(1)
     return jax.lax.scan(one, start, detections)[1]

@@ -8,10 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxtrack import Detections, Params, SearchTrack, StaticParams, Tracks, models, tracker
+from jaxtrack import Detections, Params, SearchTrack, StaticParams, models
 from reference.parity.compare import TOLERANCE
 from reference.parity.environment import pointing_or_random
 from reference.parity.episodes import compare_episode
+from reference.parity.ours import track_detections
 from reference.pipeline import StoneSoupTracker
 
 STEPS = 1000
@@ -33,19 +34,7 @@ def environment_episode(params, seed):
     return jax.lax.scan(one_step, state, jax.random.split(key_steps, STEPS))[1]
 
 
-def tracker_episode(detections, params, max_tracks):
-    """Track lists and records of the bare tracker on recorded detections `[K, D]`."""
-
-    def one_step(carry, detections):
-        tracks, index = carry
-        tracks, info = tracker.step(tracks, detections, params.time_step, index, params)
-        return (tracks, index + 1), (tracks, info)
-
-    return jax.lax.scan(one_step, (Tracks.empty(max_tracks), jnp.asarray(1)), detections)[1]
-
-
 RECORD = jax.jit(environment_episode)
-REPLAY = jax.jit(tracker_episode, static_argnums=2)
 
 
 def check_episode(detections, tracks, info, params, steps):
@@ -95,7 +84,7 @@ def test_behind_the_radar():
     recorded = RECORD(params, 4)[1]
     turned = recorded.value.at[..., 1].set(models.wrap_bearing(recorded.value[..., 1] + jnp.pi))
     detections = Detections(turned, recorded.active, recorded.truth)
-    tracks, info = jax.device_get(REPLAY(detections, params, 40))
+    tracks, info = jax.device_get(track_detections(detections, params, 40))
     happened = check_episode(jax.device_get(detections), tracks, info, params, steps)
     assert happened.updates > 0.2 * steps
     assert happened.births > happened.deletions >= 2
