@@ -23,7 +23,6 @@ STYLES = ("-", "--", "-.", ":", (0, (7, 2)), (0, (4, 1, 1, 1, 1, 1)), (0, (1, 3)
 SHADES = ("0.0", "0.45", "0.25", "0.6")
 COVARIANCE = ("covariance_x", "covariance_y", "covariance_z", "covariance_norm")
 GOSPA = ("gospa", "gospa_localisation", "gospa_missed", "gospa_false")
-COMPARED = ("gospa", "completeness", "uncertainty_per_truth")
 DARK = 0.6
 """Share of the largest value above which a cell is so dark that its text is white."""
 LABEL_GAP = 0.07
@@ -45,13 +44,18 @@ FIGURES = {
 def draw_all(played: Mapping[str, Played], summary: Summary, params: Params, folder: Path) -> dict[str, Path]:
     """Draws every figure of `FIGURES` as a PNG file; their paths by name."""
     paths = {name: folder / f"{name}.png" for name in FIGURES}
-    table = {name: {metric: tuple(row[metric]) for metric in COMPARED} for name, row in summary.mean.items()}
-    plots.comparison(table, paths["comparison"])  # type: ignore[arg-type]
+    titles = {metric: f"{METRICS[metric]}\n{direction(metric)}" for metric in RANKED}
+    plots.comparison(summary.mean, titles, paths["comparison"])
     over_time(played, COVARIANCE, params, paths["covariance"])
     over_time(played, GOSPA, params, paths["gospa"])
     improvement(summary, "gospa", paths["improvement"])
     looks(played, params, paths["looks"])
     return paths
+
+
+def direction(metric: str) -> str:
+    """Which way is good for a metric of `RANKED`, in words."""
+    return f"{'less' if RANKED[metric] else 'more'} is better"
 
 
 def over_time(
@@ -133,9 +137,8 @@ def improvement(summary: Summary, metric: str, out_png: str | Path) -> None:
     axes.set_xticks(range(len(names)), names, rotation=30, ha="right")
     axes.set_yticks(range(len(names)), names)
     axes.spines[:].set_visible(False)
-    better = "less" if RANKED[metric] else "more"
     axes.set_title(
-        f"probability that the row beats the column\n{METRICS[metric]}, {better} is better", fontsize=9.5
+        f"probability that the row beats the column\n{METRICS[metric]}, {direction(metric)}", fontsize=9.5
     )
     figure.savefig(out_png)
 

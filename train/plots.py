@@ -21,13 +21,6 @@ CURVES = {
 }
 """Columns of the metrics file that a learning curve shows, with their labels."""
 
-COMPARED = {
-    "gospa": ("GOSPA distance (m)", "less is better"),
-    "completeness": ("completeness", "more is better"),
-    "uncertainty_per_truth": ("uncertainty per truth (m\u00b2)", "less is better"),
-}
-"""Metrics that a comparison shows, with their labels and which way is good."""
-
 Interval = tuple[float, float, float]
 """Mean and the low and high end of its interval."""
 
@@ -73,20 +66,23 @@ def learning_curve(metrics_csv_path: str | Path, out_png: str | Path) -> None:
     figure.savefig(out_png)
 
 
-def comparison(table: Mapping[str, Mapping[str, Interval]], out_png: str | Path) -> None:
-    """Draws a dot and an interval per policy for every metric of `COMPARED`.
+def comparison(
+    table: Mapping[str, Mapping[str, Interval]], titles: Mapping[str, str], out_png: str | Path
+) -> None:
+    """Draws a dot and an interval per policy for every metric of `titles`.
 
     Args:
         table: policy, then metric, then (mean, low, high); policies are drawn from top to bottom.
+        titles: of the panels, by metric; what the table lacks altogether is left out.
         out_png: picture to write.
 
     Raises:
         ValueError: if there is no policy, or a policy lacks a metric that another one has.
     """
     given = {name for metrics in table.values() for name in metrics}
-    shown = [name for name in COMPARED if name in given]
+    shown = [name for name in titles if name in given]
     if not shown:
-        raise ValueError(f"table has nothing to draw: expected a policy with {', '.join(COMPARED)}")
+        raise ValueError(f"table has nothing to draw: expected a policy with {', '.join(titles)}")
     for policy, metrics in table.items():
         missing = [name for name in shown if name not in metrics]
         if missing:
@@ -94,8 +90,7 @@ def comparison(table: Mapping[str, Mapping[str, Interval]], out_png: str | Path)
     figure, places = panels(len(shown), height=1.1 + 0.28 * len(table))
     for axes, name in zip(places, shown, strict=True):
         _dots_and_intervals(axes, [metrics[name] for metrics in table.values()])
-        label, direction = COMPARED[name]
-        axes.set_title(f"{label}\n{direction}", fontsize=9.5)
+        axes.set_title(titles[name], fontsize=9.5)
         axes.set_yticks(range(len(table)), list(table) if axes is places[0] else [])
         axes.set_ylim(len(table) - 0.5, -0.5)
     figure.savefig(out_png)

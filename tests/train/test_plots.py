@@ -22,6 +22,8 @@ TABLE = {
     },
 }
 
+TITLES = {"gospa": "GOSPA", "completeness": "share", "uncertainty_per_truth": "uncertainty"}
+
 
 @pytest.fixture
 def saved(monkeypatch):
@@ -83,32 +85,33 @@ def test_a_file_without_curves_is_refused(tmp_path, header, rows, message):
 
 
 def test_a_comparison_puts_mean_and_interval_of_each_policy_in_its_row(tmp_path, saved):
-    plots.comparison(TABLE, tmp_path / "comparison.png")
+    plots.comparison(TABLE, TITLES, tmp_path / "comparison.png")
     check_picture(tmp_path / "comparison.png")
     panels = saved[0].axes
     assert [label.get_text() for label in panels[0].get_yticklabels()] == list(TABLE)
-    for axes, metric in zip(panels, plots.COMPARED, strict=True):
+    for axes, metric in zip(panels, TITLES, strict=True):
         mean, low, high = np.array([metrics[metric] for metrics in TABLE.values()]).T
         np.testing.assert_allclose(axes.get_lines()[0].get_xydata(), np.stack([mean, [0, 1]], axis=-1))
         ends = np.array(axes.collections[0].get_segments())
         np.testing.assert_allclose(ends[:, :, 0], np.stack([low, high], axis=-1))
         np.testing.assert_allclose(ends[:, :, 1], [[0, 0], [1, 1]])
+    assert [axes.get_title() for axes in panels] == list(TITLES.values())
     assert panels[0].yaxis_inverted()
 
 
 def test_a_comparison_with_holes_is_refused(tmp_path):
     with pytest.raises(ValueError, match="nothing to draw"):
-        plots.comparison({}, tmp_path / "comparison.png")
+        plots.comparison({}, TITLES, tmp_path / "comparison.png")
     holed = {**TABLE, "static": {"gospa": (446.0, 440.0, 452.0)}}
     with pytest.raises(ValueError, match=r"static.* lacks completeness, uncertainty_per_truth"):
-        plots.comparison(holed, tmp_path / "comparison.png")
+        plots.comparison(holed, TITLES, tmp_path / "comparison.png")
     assert list(tmp_path.iterdir()) == []
 
 
 def test_plots_leave_no_open_figures_and_import_matplotlib_lazily(tmp_path):
     from matplotlib import pyplot
 
-    plots.comparison(TABLE, tmp_path / "comparison.png")
+    plots.comparison(TABLE, TITLES, tmp_path / "comparison.png")
     assert pyplot.get_fignums() == []
     code = "import sys, train.plots; print('matplotlib' in sys.modules)"
     environment = {**os.environ, "JAX_PLATFORMS": "cpu", "PYTHONPATH": os.pathsep.join(sys.path)}
