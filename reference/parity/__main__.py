@@ -17,7 +17,7 @@ from jaxtrack.cli import parse, require_file, require_integer, run, wide_console
 from jaxtrack.report import circumstances
 from reference.parity.environment import environment_rows
 from reference.parity.free_running import free_running_rows
-from reference.parity.metrics import COMPARISONS, compare
+from reference.parity.metrics import COMPARISONS, metric_rows
 from reference.parity.models import NUM_MODELS, model_rows
 from reference.parity.oracle import Job, run_all
 from reference.parity.records import random_records
@@ -102,9 +102,8 @@ def measure(options: ParityOptions, progress: Progress) -> tuple[list[Row], list
 
     models = model_rows(options.seed, options.samples)
     rows += follow(models, NUM_MODELS, "models, measures, sensor")
-    recorded = random_records(options.seed, options.records)
-    compared = (compare(metric, recorded) for metric in COMPARISONS)
-    rows += follow(compared, len(COMPARISONS), "metrics")
+    metrics = metric_rows(random_records(options.seed, options.records))
+    rows += follow(metrics, len(COMPARISONS), "metrics")
     seeds = range(options.environments)
     environments, differing = environment_rows(follow(seeds, len(seeds), "environments"), steps=200)
     divergences += [f"environment: {divergence}" for divergence in differing]

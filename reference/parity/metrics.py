@@ -1,7 +1,7 @@
 """The tracking metrics beside Stone Soup's generators, over whole records."""
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 import jax
 import numpy as np
@@ -12,6 +12,7 @@ from jaxtrack.siap import siap
 from jaxtrack.types import Tracks, Truths
 from reference.components import step_duration
 from reference.parity.compare import TOLERANCE, covariance_error
+from reference.parity.ours import on_device
 from reference.parity.records import Record
 from reference.parity.rows import Row
 from reference.parity.stock_metrics import (
@@ -78,14 +79,15 @@ class Comparison:
         return dataclasses.replace(record, params=params)
 
 
-def metric_rows(records: Sequence[Record], limit: int | None = None) -> list[Row]:
+def metric_rows(records: Sequence[Record], limit: int | None = None) -> Iterator[Row]:
     """Every metric on every record, in float64 and in float32.
 
     Args:
         records: those of equal shapes are compiled once.
         limit: records on which SIAP and PCRB, which are slow in Stone Soup, are compared; unset, all.
     """
-    return [compare(one, records[: limit if one.slow else None]) for one in COMPARISONS]
+    for one in COMPARISONS:
+        yield compare(one, records[: limit if one.slow else None])
 
 
 def compare(comparison: Comparison, records: Sequence[Record]) -> Row:
@@ -96,8 +98,8 @@ def compare(comparison: Comparison, records: Sequence[Record]) -> Row:
         theirs = comparison.theirs(StockRecord(record))
         compared += sum(int(np.sum(~np.isnan(value))) for value in theirs.values())
         ties += int(np.isnan(theirs.get("track_change_rate", 0.0)))
-        double.append(comparison.error(our_numbers(comparison, record, np.float64), theirs))
-        single.append(comparison.error(our_numbers(comparison, record, np.float32), theirs))
+        double.append(comparison.error(our_numbers(comparison, record, double=True), theirs))
+        single.append(comparison.error(our_numbers(comparison, record, double=False), theirs))
     return Row(
         component=comparison.component,
         stone_soup=comparison.stone_soup,
@@ -111,17 +113,11 @@ def compare(comparison: Comparison, records: Sequence[Record]) -> Row:
     )
 
 
-def our_numbers(comparison: Comparison, record: Record, dtype: type) -> Numbers:
-    """Our numbers, computed in the given precision from inputs of that precision."""
-
-    def cast(leaf: np.ndarray) -> np.ndarray:
-        leaf = np.asarray(leaf)
-        return leaf.astype(dtype) if leaf.dtype.kind == "f" else leaf
-
+def our_numbers(comparison: Comparison, record: Record, double: bool) -> Numbers:
+    """Our numbers, computed in float64 or float32 from inputs of that precision."""
     times = np.arange(len(record.truths.alive)) * step_duration(record.params).total_seconds()
-    inputs = jax.tree.map(cast, (record.truths, record.tracks, times))
-    with jax.enable_x64(dtype is np.float64):
-        return jax.tree.map(np.asarray, _COMPILED[comparison.component](*inputs, record.params))
+    compiled = _COMPILED[comparison.component]
+    return on_device(compiled, double, record.truths, record.tracks, times, record.params)
 
 
 def our_norms(truths: Truths, tracks: Tracks, times: jax.Array, params: Params) -> Ours:

@@ -47,7 +47,7 @@ def test_metrics_over_records(comparison, records):
 
 @pytest.mark.usefixtures("quick_compilation")
 def test_a_limit_spares_the_slow_ones(records):
-    rows = metric_rows(records[:2], limit=1)
+    rows = list(metric_rows(records[:2], limit=1))
     assert [row.component for row in rows] == [one.component for one in COMPARISONS]
     assert all(row.passed for row in rows)
     for row, one in zip(rows, COMPARISONS, strict=True):
@@ -100,7 +100,7 @@ def overlap(stock, associations):
 @pytest.mark.usefixtures("quick_compilation")
 def test_the_switching_penalty_is_paid_in_the_random_records(records):
     (comparison,) = (one for one in COMPARISONS if one.switching)
-    found = our_numbers(comparison, records[1], np.float64)["switching"]
+    found = our_numbers(comparison, records[1], double=True)["switching"]
     assert len(np.unique(np.round(found, 6))) > 4  # halves and wholes
 
 
