@@ -144,9 +144,12 @@ def train(
             save(manager, state)
         last = manager.latest_step()
     if code:
-        where = f"checkpoint of update {last} in {folder}" if last else f"no checkpoint yet in {folder}"
-        console.print(f"stopped after {update + 1} updates; {where}")
-        console.print(f"evaluate it with: python -m train.evaluate --run {folder}")
+        stopped = f"stopped after {update + 1} updates"
+        if last is None:
+            console.print(f"{stopped}; no checkpoint yet in {folder}, so nothing to evaluate")
+        else:
+            console.print(f"{stopped}; checkpoint of update {last} in {folder}")
+            console.print(f"evaluate it with: python -m train.evaluate --run {folder}")
     return state, code
 
 

@@ -174,6 +174,22 @@ def test_a_training_that_diverges_says_so_and_keeps_the_last_good_checkpoint(
     assert checkpoints(folder) == [2]
 
 
+def test_without_a_checkpoint_there_is_nothing_to_evaluate(whole, tmp_path, monkeypatch, capsys):
+    _, compiled = whole[2]
+
+    def diverging(state):
+        after, metrics = compiled(state)
+        return after, {**metrics, "value_loss": np.float32(np.nan)}
+
+    folder = tmp_path / "run"
+    assert train_again(whole, folder, monkeypatch, compiled=diverging) == 1
+    said = " ".join(capsys.readouterr().out.split())
+    assert "stopped after 1 updates; no checkpoint yet in" in said
+    assert "nothing to evaluate" in said
+    assert "train.evaluate" not in said
+    assert checkpoints(folder) == []
+
+
 def test_the_same_seed_gives_the_same_numbers(whole, tmp_path, monkeypatch):
     train_again(whole, tmp_path / "run", monkeypatch)
     clock = ("seconds", "steps_per_second")
