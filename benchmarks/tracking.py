@@ -20,14 +20,13 @@ from jaxtrack.params import Params
 from jaxtrack.report import circumstances, print_table
 from jaxtrack.track import Options, track_file
 from jaxtrack.tracking import TrackRows, track_scans
-from reference.components import noise_sigmas
+from reference.components import EPOCH, noise_sigmas
 from reference.parity.compare import TOLERANCE, covariance_error, mean_error
 from reference.parity.scenes import spherical
 from reference.pipeline import StepRecord, StoneSoupTracker
 from reference.translate import TrackKey
 
 DIFFERENT = 1
-EPOCH = datetime.datetime(1970, 1, 1)
 PARAMS = Params(process_noise=10.0)
 INTERVAL, DETECTED, CLUTTER = 0.1, 0.95, 1.0
 """Time between scans (s), probability of detection, false detections per scan."""
