@@ -239,9 +239,15 @@ def allowed_range(field: dataclasses.Field) -> str:
     return f"{'(' if field.metadata['open_low'] else '['}{low:g}, {high:g}{')' if math.isinf(high) else ']'}"
 
 
+def with_unit(text: str, field: dataclasses.Field) -> str:
+    """The text with the unit of a number of `Params` after it; as it is where the unit is 1."""
+    unit = field.metadata["unit"]
+    return text if unit == "1" else f"{text} {unit}"
+
+
 def _check_quantity(field: dataclasses.Field, value: Any) -> None:
     low, high = field.metadata["low"], field.metadata["high"]
-    expected = f"expected a number in {allowed_range(field)} {field.metadata['unit']}"
+    expected = f"expected a number in {with_unit(allowed_range(field), field)}"
     try:
         numbers = np.asarray(value, dtype=float)
     except (TypeError, ValueError):

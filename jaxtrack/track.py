@@ -27,7 +27,7 @@ from rich.progress import (
 
 from jaxtrack.cli import parse, require_file, run, take_config
 from jaxtrack.detection_file import RecordedDetections, read_detections
-from jaxtrack.params import Params, StaticParams, allowed_range, validate
+from jaxtrack.params import Params, StaticParams, allowed_range, validate, with_unit
 from jaxtrack.track_file import TrackWriter, partial_path
 from jaxtrack.track_plot import SUFFIXES, TrackPaths
 from jaxtrack.tracking import track_scans
@@ -117,7 +117,7 @@ def track_file(recorded: RecordedDetections, params: Params, options: Options) -
             _progress() as progress,
             contextlib.closing(track_scans(recorded, params)) as chunks,
         ):
-            task = progress.add_task("tracking", total=len(recorded.time), speed="")
+            task = progress.add_task("tracking", total=len(recorded.time), speed="compiling")
             for rows in chunks:
                 writer.write(rows)
                 if paths:
@@ -184,8 +184,8 @@ def help_text() -> str:
     lines = [HELP]
     for field in dataclasses.fields(Params):
         if field.name in TRACKER_FIELDS:
-            unit = "" if field.metadata["unit"] == "1" else f" {field.metadata['unit']}"
-            lines.append(f"  {field.name} = {field.default:g}{unit}, in {allowed_range(field)}")
+            default = with_unit(f"{field.default:g}", field)
+            lines.append(f"  {field.name} = {default}, in {allowed_range(field)}")
     return "\n".join(lines)
 
 

@@ -96,6 +96,8 @@ def test_the_upper_end_of_each_range_is_closed(name):
 def test_the_message_names_value_range_and_unit():
     with pytest.raises(ValueError, match=r"^time_step = -0\.1: expected a number in \(0, inf\) s$"):
         validate(StaticParams(), Params(time_step=-0.1))
+    with pytest.raises(ValueError, match=r"^alpha = -0\.1: expected a number in \(0, inf\)$"):
+        validate(StaticParams(), Params(alpha=-0.1))
 
 
 def test_arrays_meant_for_vmap_are_checked_entry_by_entry():

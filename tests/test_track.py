@@ -145,6 +145,24 @@ def test_ctrl_c_leaves_the_scans_done(recorded, chunks, tmp_path, monkeypatch, c
     assert f"the first 5 of 5 scans are in {out}.partial\ninterrupted\n" in capsys.readouterr().err
 
 
+@pytest.mark.usefixtures("one_call")
+def test_the_bar_says_what_it_waits_for(recorded, tmp_path, monkeypatch):
+    said = []
+
+    class Spy(track.Progress):
+        def add_task(self, *words, **fields):
+            said.append(fields["speed"])
+            return super().add_task(*words, **fields)
+
+        def update(self, task, **fields):
+            said.append(fields["speed"])
+
+    monkeypatch.setattr(track, "Progress", Spy)
+    track.main([str(recorded), "--out", str(tmp_path / "tracks.csv")])
+    assert said[0] == "compiling"
+    assert said[1].endswith(" scans/s")
+
+
 def test_a_row_that_was_cut_is_removed(recorded, chunks, tmp_path):
     def stopped_while_writing():
         with TrackWriter(tmp_path / "tracks.csv", TIMES) as writer:

@@ -35,6 +35,7 @@ def test_numbers_come_from_the_file_and_the_command_line_wins(recorded, tmp_path
         ({"sigma": 1}, "sigma: no number of the tracker"),
         ({"alpha": "wide"}, "alpha = 'wide': expected a number in (0, inf)"),
         ({"alpha": -1.0}, "alpha = -1.0: expected a number in (0, inf)"),
+        ({"range_sigma": 0.0}, "range_sigma = 0.0: expected a number in (0, inf) m"),
         ({"kappa": "nan"}, "kappa = nan: expected a number in (-6, inf)"),
         ({"alpha": True}, "alpha = True: expected a number"),
         ({"alpha": [1.0, 2.0]}, "alpha = [1.0, 2.0]: expected a number"),
