@@ -9,8 +9,10 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 
-from jaxtrack.kalman import ExpectedDetections, determinant_3x3, inverse_3x3, measurement_noise
-from jaxtrack.models import wrap_detection
+from jaxtrack.kalman import ExpectedDetections
+from jaxtrack.kernel import add_up
+from jaxtrack.matrices import batch_first, batch_last, determinant_3x3, inverse_3x3
+from jaxtrack.models import measurement_noise, wrap_detection
 from jaxtrack.params import Params
 from jaxtrack.types import DETECTION_DIM, NO_DETECTION, Detections, Tracks
 
@@ -21,8 +23,7 @@ Measure = Callable[[ExpectedDetections, Detections, Params], jax.Array]
 def squared_mahalanobis(expected: ExpectedDetections, detections: Detections, params: Params) -> jax.Array:
     """``d^T S^-1 d`` with ``d = wrap(zbar - z)`` (`SquaredMahalanobis`)."""
     del params
-    inverse_S = jax.vmap(inverse_3x3)(expected.covariance)
-    return _quadratic(_differences(expected, detections), inverse_S)
+    return _quadratic(_differences(expected, detections), _inverses(expected.covariance))
 
 
 def mahalanobis(expected: ExpectedDetections, detections: Detections, params: Params) -> jax.Array:
@@ -34,7 +35,7 @@ def euclidean(expected: ExpectedDetections, detections: Detections, params: Para
     """Length of ``wrap(zbar - z)``, radians and metres mixed (`Euclidean`)."""
     del params
     d = _differences(expected, detections)
-    return jnp.sqrt((d * d).sum(axis=-1))
+    return jnp.sqrt(add_up(d * d, axis=-1))
 
 
 def kullback_leibler(expected: ExpectedDetections, detections: Detections, params: Params) -> jax.Array:
@@ -44,8 +45,8 @@ def kullback_leibler(expected: ExpectedDetections, detections: Detections, param
     """
     R, S = measurement_noise(params), expected.covariance
     inverse_R = inverse_3x3(R)
-    log_ratio = jnp.log(determinant_3x3(R) / jax.vmap(determinant_3x3)(S))
-    fixed = log_ratio - DETECTION_DIM + (inverse_R * S).sum(axis=(-2, -1))
+    log_ratio = jnp.log(determinant_3x3(R) / _determinants(S))
+    fixed = log_ratio - DETECTION_DIM + add_up(add_up(inverse_R * S, axis=-1), axis=-1)
     spread = jnp.broadcast_to(inverse_R, S.shape)
     return 0.5 * (fixed[:, None] + _quadratic(_differences(expected, detections), spread))
 
@@ -57,9 +58,8 @@ def squared_hellinger(expected: ExpectedDetections, detections: Detections, para
     """
     R, S = measurement_noise(params), expected.covariance
     middle = (S + R) / 2
-    determinants = jax.vmap(determinant_3x3)
-    overlap = jnp.sqrt(jnp.sqrt(determinants(S) * determinant_3x3(R)) / determinants(middle))
-    exponent = _quadratic(_differences(expected, detections), jax.vmap(inverse_3x3)(middle)) / 8
+    overlap = jnp.sqrt(jnp.sqrt(_determinants(S) * determinant_3x3(R)) / _determinants(middle))
+    exponent = _quadratic(_differences(expected, detections), _inverses(middle)) / 8
     return jnp.maximum(1 - overlap[:, None] * jnp.exp(-exponent), 0.0)
 
 
@@ -79,6 +79,14 @@ MEASURES: dict[str, Measure] = {
 """Measures by name; gate threshold and missed distance have the measure's unit."""
 
 
+def _inverses(matrices: jax.Array) -> jax.Array:
+    return batch_first(inverse_3x3(batch_last(matrices)))
+
+
+def _determinants(matrices: jax.Array) -> jax.Array:
+    return determinant_3x3(batch_last(matrices))
+
+
 def _differences(expected: ExpectedDetections, detections: Detections) -> jax.Array:
     """``wrap(zbar - z)`` `[T, D, 3]`."""
     return wrap_detection(expected.mean[:, None] - detections.value[None])
@@ -86,8 +94,8 @@ def _differences(expected: ExpectedDetections, detections: Detections) -> jax.Ar
 
 def _quadratic(d: jax.Array, matrix: jax.Array) -> jax.Array:
     """``d^T M d`` `[T, D]` of differences `[T, D, 3]` and one matrix `[T, 3, 3]` per track."""
-    weighted = (d[..., None] * matrix[:, None]).sum(axis=-2)
-    return (weighted * d).sum(axis=-1)
+    weighted = add_up(d[..., None] * matrix[:, None], axis=-2)
+    return add_up(weighted * d, axis=-1)
 
 
 def gate(distances: jax.Array, predicted: Tracks, detections: Detections, params: Params) -> jax.Array:

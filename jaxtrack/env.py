@@ -1,6 +1,7 @@
 """The environment `SearchTrack-v0` in gymnax form. It holds no mathematics of its own."""
 
 import dataclasses
+from functools import partial
 from typing import Any
 
 import gymnax
@@ -11,10 +12,11 @@ from gymnax.environments import environment
 
 from jaxtrack import metrics, spaces, tracker
 from jaxtrack.association import MEASURES
+from jaxtrack.kernel import Function, one_by_one
 from jaxtrack.observation import TRACK_FEATURES, Observation, observe
 from jaxtrack.params import Params, StaticParams, check_trajectories, validate
 from jaxtrack.reward import reward_terms
-from jaxtrack.scan_map import initial_scan_map, update_scan_map
+from jaxtrack.scan_map import initial_scan_map, mean_scan_value, update_scan_map
 from jaxtrack.sensor import SensorNoise, detect, look_angles, sample_noise
 from jaxtrack.truth import TruthNoise, initiate_truths, propagate_truths, sample_truth_noise
 from jaxtrack.types import Detections, Tracks, Truths
@@ -23,6 +25,9 @@ ENV_ID = "SearchTrack-v0"
 
 ALWAYS_IN_INFO = ("completeness", "covariance_norm_sum", "covariance_norm_mean")
 """Metrics that are cheap enough for every step."""
+
+LARGEST_IN_ONE_KERNEL = {"max_tracks": 200, "num_truths": 100, "max_detections": 50, "max_clutter": 50}
+"""Larger scenarios are stepped all at once: XLA spreads their arrays over threads, one kernel can not."""
 
 
 @struct.dataclass
@@ -66,14 +71,16 @@ class StepRecord(struct.PyTreeNode):
         detections: what the look returned.
         num_dropped_truths: `[]` births for which no row was left.
         num_dropped_detections: `[]` detections for which no slot was free.
-        tracker: every intermediate of the tracker.
+        num_dropped_tracks: `[]` new tracks for which no slot was free.
+        tracker: every intermediate of the tracker, or None where `play` left it out.
     """
 
     look: jax.Array
     detections: Detections
     num_dropped_truths: jax.Array
     num_dropped_detections: jax.Array
-    tracker: tracker.TrackerInfo
+    num_dropped_tracks: jax.Array
+    tracker: tracker.TrackerInfo | None
 
 
 class SearchTrack(environment.Environment[EnvState, Params]):
@@ -107,10 +114,31 @@ class SearchTrack(environment.Environment[EnvState, Params]):
         """Number of discrete looks."""
         return self.static.num_looks**2
 
+    @partial(jax.jit, static_argnames=("self",))
+    def step(
+        self, key: jax.Array, state: EnvState, action: jax.Array, params: Params | None = None
+    ) -> tuple[Observation, EnvState, jax.Array, jax.Array, jax.Array, dict[str, Any]]:
+        """`step_env`, and a new episode where one ended: gymnax's `step`, which makes one at every step."""
+        params = self.default_params if params is None else params
+        key_step, key_reset = jax.random.split(key)
+        last, moved, reward, terminated, info = self.step_env(key_step, state, action, params)
+        truncated = self.is_truncated(moved, params)
+        done = terminated | truncated
+        truths = self._one_by_one(self._initiate_truths_if)(done, key_reset, moved.truths, params)
+        first = self._begin(truths, params)
+        observation, state = jax.tree.map(lambda new, old: jnp.where(done, new, old), first, (last, moved))
+        ended = {"terminated": terminated, "truncated": truncated, "final_observation": last}
+        return observation, state, reward, terminated, truncated, {**info, **ended}
+
+    def _initiate_truths_if(self, done: jax.Array, key: jax.Array, truths: Truths, params: Params) -> Truths:
+        return jax.lax.cond(done, lambda: initiate_truths(key, self.static, params), lambda: truths)
+
     def reset_env(self, key: jax.Array, params: Params) -> tuple[Observation, EnvState]:
         """New truths, no tracks, a field never seen."""
         check_trajectories(self.static, params)
-        truths = initiate_truths(key, self.static, params)
+        return self._begin(initiate_truths(key, self.static, params), params)
+
+    def _begin(self, truths: Truths, params: Params) -> tuple[Observation, EnvState]:
         state = EnvState(
             time=jnp.asarray(0, dtype=int),
             truths=truths,
@@ -119,38 +147,66 @@ class SearchTrack(environment.Environment[EnvState, Params]):
             num_born=jnp.sum(truths.alive),
             num_initiated=jnp.asarray(0, dtype=int),
         )
-        return self.observe(key, state, None, params), state
+        return observe(state.tracks, state.scan_map, params), state
 
     def step_env(
         self, key: jax.Array, state: EnvState, action: jax.Array, params: Params
     ) -> tuple[Observation, EnvState, jax.Array, jax.Array, dict[str, jax.Array]]:
         """One step: observation, state, reward, terminated, info."""
         before = state
-        state, record = self.advance(state, action, self.sample_noise(key), params)
+        state, record = self.play(key, state, action, params)
         terms = reward_terms(before.tracks, state.tracks, state.truths, state.scan_map, self.static, params)
         info = step_info(state, record, terms, self.static, params)
         observation = self.observe(key, state, action, params)
         return observation, state, terms[0] + terms[1], self.is_terminated(state, params), info
 
+    def play(
+        self, key: jax.Array, state: EnvState, action: jax.Array, params: Params
+    ) -> tuple[EnvState, StepRecord]:
+        """`advance` with noise from the key, fast for many scenarios; the record lacks the `tracker`."""
+        # The map is the same work for all and the larger part of the state: it stays outside.
+        without_map = state.replace(scan_map=None)
+        moved, record = self._one_by_one(self._draw_and_track)(key, without_map, action, params)
+        scan_map = update_scan_map(state.scan_map, record.look, self.static, params)
+        return moved.replace(scan_map=scan_map), record
+
     def advance(
         self, state: EnvState, action: jax.Array, noise: StepNoise, params: Params
     ) -> tuple[EnvState, StepRecord]:
         """The deterministic core: truths move, the radar looks, the tracker runs."""
+        moved, record = self._look_and_track(state, action, noise, params)
+        scan_map = update_scan_map(state.scan_map, record.look, self.static, params)
+        return moved.replace(scan_map=scan_map), record
+
+    def _one_by_one(self, function: Function) -> Function:
+        sizes = vars(self.static)
+        fits = all(sizes[name] <= largest for name, largest in LARGEST_IN_ONE_KERNEL.items())
+        return one_by_one(function) if fits else function
+
+    def _draw_and_track(
+        self, key: jax.Array, state: EnvState, action: jax.Array, params: Params
+    ) -> tuple[EnvState, StepRecord]:
+        state, record = self._look_and_track(state, action, self.sample_noise(key), params)
+        return state, record.replace(tracker=None)
+
+    def _look_and_track(
+        self, state: EnvState, action: jax.Array, noise: StepNoise, params: Params
+    ) -> tuple[EnvState, StepRecord]:
+        """All of a step but the scan map."""
         time = state.time + 1
         truths, num_born, rowless = propagate_truths(state.truths, state.num_born, noise.truths, time, params)
         look = look_angles(action, self.static, params)
         detections, num_dropped = detect(truths, look, noise.sensor, self.static, params)
         measure = MEASURES[self.static.measure]
         tracks, info = tracker.step(state.tracks, detections, params.time_step, time, params, measure)
-        scan_map = update_scan_map(state.scan_map, look, self.static, params)
         num_initiated = state.num_initiated + jnp.sum(info.initiated)
-        state = EnvState(time, truths, tracks, scan_map, num_born, num_initiated)
-        return state, StepRecord(look, detections, rowless, num_dropped, info)
+        state = EnvState(time, truths, tracks, state.scan_map, num_born, num_initiated)
+        return state, StepRecord(look, detections, rowless, num_dropped, info.num_dropped, info)
 
     def sample_noise(self, key: jax.Array) -> StepNoise:
         """Draws all that is random in one step; the key is consumed."""
-        key_motion, key_sensor, key_life = jax.random.split(key, 3)
-        truths = sample_truth_noise(key_motion, key_life, self.static.num_truths)
+        key_truths, key_sensor = jax.random.split(key)
+        truths = sample_truth_noise(key_truths, self.static.num_truths)
         return StepNoise(truths=truths, sensor=sample_noise(key_sensor, self.static))
 
     def observe(
@@ -198,13 +254,13 @@ def step_info(
     return {
         **{name: metric(state.truths, state.tracks, params) for name, metric in asked.items()},
         "live_tracks": jnp.sum(state.tracks.active),
-        "mean_scan_value": jnp.mean(state.scan_map),
+        "mean_scan_value": mean_scan_value(state.scan_map),
         "reward_track": terms[0],
         "reward_search": terms[1],
         "num_detections": jnp.sum(record.detections.active),
         "dropped_truths": record.num_dropped_truths,
         "dropped_detections": record.num_dropped_detections,
-        "dropped_tracks": record.tracker.num_dropped,
+        "dropped_tracks": record.num_dropped_tracks,
     }
 
 

@@ -6,10 +6,17 @@ Counterparts in Stone Soup: `CovarianceBasedDeleter`, `SimpleMeasurementInitiato
 import jax
 import jax.numpy as jnp
 
-from jaxtrack.kalman import measurement_noise
-from jaxtrack.models import inverse_elevation_bearing_range, inverse_jacobian
+from jaxtrack.kernel import add_up
+from jaxtrack.models import (
+    interleave,
+    interleave_blocks,
+    inverse_elevation_bearing_range,
+    inverse_jacobian,
+    measurement_sigmas,
+)
 from jaxtrack.params import Params
-from jaxtrack.types import NO_DETECTION, POSITION, VELOCITY, Detections, Tracks, where_rows
+from jaxtrack.sampling import matches
+from jaxtrack.types import NO_DETECTION, Detections, Tracks, where_rows
 
 
 def delete_uncertain_tracks(tracks: Tracks, params: Params) -> Tracks:
@@ -18,7 +25,7 @@ def delete_uncertain_tracks(tracks: Tracks, params: Params) -> Tracks:
     Strictly: a track exactly at the threshold lives. Runs after the update and before
     initiation, so that a track can not die on the step of its birth.
     """
-    trace = jnp.trace(tracks.covariance, axis1=-2, axis2=-1)
+    trace = add_up(jnp.diagonal(tracks.covariance, axis1=-2, axis2=-1), axis=-1)
     return tracks.replace(active=tracks.active & ~(trace > params.deletion_threshold))
 
 
@@ -44,14 +51,8 @@ def initiate_tracks(
         The track list, and the number of detections for which no slot was free.
     """
     # The k-th free slot takes the k-th unassociated detection.
-    is_free = ~tracks.active
-    rank = jnp.cumsum(is_free) - 1
-    queue = jnp.argsort(~is_unassociated, stable=True)
-    num_waiting = jnp.sum(is_unassociated)
-    born = is_free & (rank < num_waiting)
-    source = queue[jnp.clip(rank, 0, queue.shape[0] - 1)]
-
-    mean, covariance = jax.vmap(initial_estimate, in_axes=(0, None))(detections.value, params)
+    born, source = matches(~tracks.active, is_unassociated)
+    mean, covariance = initial_estimate(detections.value, params)
     initiated = Tracks(
         mean=where_rows(born, mean[source], tracks.mean),
         covariance=where_rows(born, covariance[source], tracks.covariance),
@@ -61,20 +62,19 @@ def initiate_tracks(
         birth_detection=jnp.where(born, source, tracks.birth_detection),
         age=jnp.where(born, 0, tracks.age),
     )
-    return initiated, num_waiting - jnp.sum(born)
+    return initiated, jnp.sum(is_unassociated) - jnp.sum(born)
 
 
 def initial_estimate(detection: jax.Array, params: Params) -> tuple[jax.Array, jax.Array]:
-    """State and covariance of a track from one detection `[3]`.
+    """States `[..., 6]` and covariances `[..., 6, 6]` of tracks from one detection `[..., 3]` each.
 
     The position is the inverse measurement with covariance ``G R G^T``, G the exact Jacobian
     of the inverse; the velocity is the prior's, zero with `prior_velocity_sigma`.
     """
-    G = inverse_jacobian(detection)
-    mean = jnp.zeros(6).at[jnp.array(POSITION)].set(inverse_elevation_bearing_range(detection))
-    position_covariance = G @ measurement_noise(params) @ G.T
-    velocity_covariance = params.prior_velocity_sigma**2 * jnp.eye(3)
-    covariance = jnp.zeros((6, 6))
-    covariance = covariance.at[jnp.ix_(jnp.array(POSITION), jnp.array(POSITION))].set(position_covariance)
-    covariance = covariance.at[jnp.ix_(jnp.array(VELOCITY), jnp.array(VELOCITY))].set(velocity_covariance)
-    return mean, covariance
+    place = inverse_elevation_bearing_range(detection)
+    root = inverse_jacobian(detection) * measurement_sigmas(params)
+    of_place = add_up(root[..., :, None, :] * root[..., None, :, :], axis=-1)
+    of_velocity = jnp.broadcast_to(params.prior_velocity_sigma**2 * jnp.eye(3), of_place.shape)
+    none = jnp.zeros_like(of_place)
+    covariance = interleave_blocks(of_place, none, none, of_velocity)
+    return interleave(place, jnp.zeros_like(place)), covariance

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import optax
 from flax import struct
 
+from jaxtrack.kernel import add_up
 from jaxtrack.observation import covariance_norms
 from jaxtrack.params import Params
 from jaxtrack.types import Tracks, Truths, position
@@ -67,7 +68,7 @@ def position_distances(truths: Truths, tracks: Tracks) -> jax.Array:
 
 def pairwise_distances(a: jax.Array, b: jax.Array) -> jax.Array:
     """Euclidean distances `[N, T]` of vectors `[N, 3]` from vectors `[T, 3]`."""
-    return jnp.sqrt(jnp.sum((a[:, None] - b[None]) ** 2, axis=-1))
+    return jnp.sqrt(add_up((a[:, None] - b[None]) ** 2, axis=-1))
 
 
 def gospa(truths: Truths, tracks: Tracks, params: Params) -> Gospa:

@@ -4,10 +4,14 @@ Counterparts in Stone Soup: `CombinedLinearGaussianTransitionModel` of `Constant
 and `CartesianToElevationBearingRange` with its typed angles.
 """
 
+import math
+from collections.abc import Sequence
+
 import jax
 import jax.numpy as jnp
 
-from jaxtrack.types import Scalar, position
+from jaxtrack.params import Params
+from jaxtrack.types import STATE_DIM, Scalar, position
 
 
 def constant_velocity(time_step: Scalar, process_noise: Scalar) -> tuple[jax.Array, jax.Array]:
@@ -28,6 +32,32 @@ def constant_velocity(time_step: Scalar, process_noise: Scalar) -> tuple[jax.Arr
     return jnp.kron(axes, F), jnp.kron(axes, Q)
 
 
+def arctan2(y: jax.Array, x: jax.Array) -> jax.Array:
+    """Angle (rad) of ``(x, y)``, elementwise, of arrays of one shape: within 2 units in the last place.
+
+    In float32 by a polynomial (Cephes' `atanf`), which a CPU works out for many elements at
+    once; the library's function goes one by one. In float64 the library's.
+    """
+    if y.dtype != jnp.float32:
+        return jnp.arctan2(y, x)
+    shape, y, x = y.shape, y.ravel(), x.ravel()
+    short, long = jnp.minimum(jnp.abs(x), jnp.abs(y)), jnp.maximum(jnp.abs(x), jnp.abs(y))
+    # Beyond pi/8 the angle is taken from pi/4.
+    beyond = short > math.tan(math.pi / 8) * long
+    numerator = jnp.where(beyond, short - long, short)
+    denominator = jnp.where(beyond, short + long, long)
+    slope = numerator / jnp.where(denominator == 0, 1.0, denominator)
+    square = slope * slope
+    series = jnp.full_like(square, 8.05374449538e-2)
+    for coefficient in (-1.38776856032e-1, 1.99777106478e-1, -3.33329491539e-1):
+        series = series * square + coefficient
+    angle = slope + slope * square * series
+    angle = jnp.where(beyond, math.pi / 4 + angle, angle)
+    angle = jnp.where(jnp.abs(y) > jnp.abs(x), math.pi / 2 - angle, angle)
+    angle = jnp.where(x < 0, math.pi - angle, angle)
+    return jnp.copysign(angle, y).reshape(shape)
+
+
 def wrap_bearing(angle: jax.Array) -> jax.Array:
     """Angle (rad) in [-pi, pi), as Stone Soup's `Bearing`."""
     return angle - 2 * jnp.pi * jnp.floor((angle + jnp.pi) / (2 * jnp.pi))
@@ -43,9 +73,10 @@ def fold_elevation(angle: jax.Array) -> jax.Array:
     return jnp.where(over_the_top, jnp.copysign(jnp.pi, wrapped) - wrapped, wrapped)
 
 
-def wrap_detection(value: jax.Array) -> jax.Array:
-    """Folds the elevation and wraps the bearing of `[..., 3]` detections or differences."""
-    return jnp.stack([fold_elevation(value[..., 0]), wrap_bearing(value[..., 1]), value[..., 2]], axis=-1)
+def wrap_detection(value: jax.Array, axis: int = -1) -> jax.Array:
+    """Folds the elevation and wraps the bearing of detections or differences, 3 along `axis`."""
+    elevation, bearing, distance = jnp.moveaxis(value, axis, 0)
+    return jnp.stack([fold_elevation(elevation), wrap_bearing(bearing), distance], axis=axis)
 
 
 def elevation_bearing_range(state: jax.Array) -> jax.Array:
@@ -53,33 +84,33 @@ def elevation_bearing_range(state: jax.Array) -> jax.Array:
     return spherical(position(state))
 
 
-def spherical(points: jax.Array) -> jax.Array:
-    """Elevation, bearing (rad) and range (m) `[..., 3]` of positions `[..., 3]` (m)."""
-    x, y, z = points[..., 0], points[..., 1], points[..., 2]
+def spherical(points: jax.Array, axis: int = -1) -> jax.Array:
+    """Elevation, bearing (rad) and range (m) of positions (m), 3 along `axis` of both."""
+    x, y, z = jnp.moveaxis(points, axis, 0)
     ground_range = jnp.sqrt(x**2 + y**2)
-    return jnp.stack(
-        # atan2 equals Stone Soup's arcsin(z/r) and keeps its precision near the zenith.
-        [jnp.arctan2(z, ground_range), jnp.arctan2(y, x), jnp.sqrt(x**2 + y**2 + z**2)],
-        axis=-1,
-    )
+    # atan2 equals Stone Soup's arcsin(z/r) and keeps its precision near the zenith.
+    elevation, bearing = arctan2(jnp.stack([z, y]), jnp.stack([ground_range, x]))
+    return jnp.stack([elevation, bearing, jnp.sqrt(x**2 + y**2 + z**2)], axis=axis)
 
 
-def spherical_offsets(centre: jax.Array, displacement: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+def spherical_offsets(
+    centre: Sequence[jax.Array], displacement: Sequence[jax.Array]
+) -> tuple[jax.Array, ...]:
     """Change of elevation, bearing and range from `centre` to ``centre + displacement``.
 
     Taken from cross and dot products, so that nothing cancels in float32 and no angle is
     computed twice.
 
     Args:
-        centre: `[3]` position (m).
-        displacement: `[..., 3]` (m).
+        centre: x, y, z of positions, three arrays of one shape (m).
+        displacement: the same of displacements (m).
 
     Returns:
-        Sines `[..., 2]` and cosines `[..., 2]` of the changes of elevation and bearing, and
-        the changes of range `[...]` (m).
+        Sine and cosine of the change of elevation, sine and cosine of the change of bearing,
+        and the change of range (m), five arrays.
     """
-    x, y, z = centre[0], centre[1], centre[2]
-    dx, dy, dz = displacement[..., 0], displacement[..., 1], displacement[..., 2]
+    x, y, z = centre
+    dx, dy, dz = displacement
     ground = jnp.sqrt((x + dx) ** 2 + (y + dy) ** 2)
     slant = jnp.sqrt(ground**2 + (z + dz) ** 2)
     ground_centre = jnp.sqrt(x**2 + y**2)
@@ -88,11 +119,34 @@ def spherical_offsets(centre: jax.Array, displacement: jax.Array) -> tuple[jax.A
     ground_change = ground_square_change / (ground + ground_centre)
     range_change = (ground_square_change + (2 * z + dz) * dz) / (slant + slant_centre)
     slants, grounds = slant * slant_centre, ground * ground_centre
-    sine = jnp.stack(
-        [(dz * ground_centre - z * ground_change) / slants, (x * dy - y * dx) / grounds], axis=-1
+    return (
+        (dz * ground_centre - z * ground_change) / slants,
+        (grounds + (z + dz) * z) / slants,
+        (x * dy - y * dx) / grounds,
+        (x * (x + dx) + y * (y + dy)) / grounds,
+        range_change,
     )
-    cosine = jnp.stack([(grounds + (z + dz) * z) / slants, (x * (x + dx) + y * (y + dy)) / grounds], axis=-1)
-    return sine, cosine, range_change
+
+
+def interleave(positions: jax.Array, velocities: jax.Array) -> jax.Array:
+    """States `[..., 6]` of positions `[..., 3]` (m) and velocities `[..., 3]` (m/s)."""
+    return jnp.stack([positions, velocities], axis=-1).reshape(*positions.shape[:-1], STATE_DIM)
+
+
+def interleave_blocks(pp: jax.Array, pv: jax.Array, vp: jax.Array, vv: jax.Array) -> jax.Array:
+    """Matrices `[..., 6, 6]` of their blocks `[..., 3, 3]` of positions p and velocities v."""
+    upper, lower = jnp.stack([pp, pv], axis=-1), jnp.stack([vp, vv], axis=-1)
+    return jnp.stack([upper, lower], axis=-3).reshape(*pp.shape[:-2], STATE_DIM, STATE_DIM)
+
+
+def measurement_sigmas(params: Params) -> jax.Array:
+    """Standard deviations `[3]` of measured elevation, bearing (rad) and range (m)."""
+    return jnp.array([params.elevation_sigma, params.bearing_sigma, params.range_sigma], dtype=float)
+
+
+def measurement_noise(params: Params) -> jax.Array:
+    """Measurement noise covariance R `[3, 3]` (rad^2, rad^2, m^2)."""
+    return jnp.diag(measurement_sigmas(params) ** 2)
 
 
 def direction(azimuth: jax.Array, elevation: jax.Array) -> jax.Array:
@@ -113,9 +167,12 @@ def inverse_elevation_bearing_range(detection: jax.Array) -> jax.Array:
 
 
 def inverse_jacobian(detection: jax.Array) -> jax.Array:
-    """Derivative `[3, 3]` of the position by (elevation, bearing, range) at one detection `[3]`.
+    """Derivative `[..., 3, 3]` of the position by (elevation, bearing, range) at detections `[..., 3]`.
 
     The inverse of h's Jacobian at that position. Stone Soup takes the latter by finite
     differences, which is only good to about 1e-5.
     """
-    return jax.jacfwd(inverse_elevation_bearing_range)(detection)
+    elevation, bearing, distance = jnp.moveaxis(detection, -1, 0)
+    ahead, above = direction(bearing, elevation), direction(bearing, elevation + jnp.pi / 2)
+    aside = jnp.stack([-ahead[..., 1], ahead[..., 0], jnp.zeros_like(distance)], axis=-1)
+    return jnp.stack([distance[..., None] * above, distance[..., None] * aside, ahead], axis=-1)

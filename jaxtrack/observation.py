@@ -5,7 +5,7 @@ import jax.numpy as jnp
 
 from jaxtrack.models import elevation_bearing_range
 from jaxtrack.params import Params
-from jaxtrack.types import Tracks, velocity
+from jaxtrack.types import STATE_DIM, Tracks, velocity
 
 TRACK_FEATURES = 7
 """Range, azimuth, elevation, vx, vy, vz, Frobenius norm of the covariance."""
@@ -59,4 +59,5 @@ def feature_scales(params: Params) -> jax.Array:
 
 def covariance_norms(tracks: Tracks) -> jax.Array:
     """Frobenius norm `[T]` of every slot's 6x6 covariance, mixed units as in Stone Soup."""
-    return jnp.sqrt(jnp.sum(tracks.covariance**2, axis=(-2, -1)))
+    entries = tracks.covariance.reshape(*tracks.active.shape, STATE_DIM**2)
+    return jnp.sqrt(jnp.sum(entries**2, axis=-1))

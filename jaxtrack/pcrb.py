@@ -8,9 +8,9 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from jaxtrack.kalman import inverse_3x3, measurement_noise
 from jaxtrack.lifecycle import initial_estimate
-from jaxtrack.models import constant_velocity, elevation_bearing_range
+from jaxtrack.matrices import inverse_3x3
+from jaxtrack.models import constant_velocity, elevation_bearing_range, measurement_noise
 from jaxtrack.params import Params
 from jaxtrack.types import POSITION, VELOCITY, Scalar, Truths
 
@@ -92,7 +92,7 @@ def initial_covariances(truths: Truths, params: Params) -> jax.Array:
     # A truth that never lives may lie at the origin, where no direction exists.
     somewhere = jnp.zeros(6).at[0].set(params.min_range)
     state = jnp.where(jnp.any(truths.alive, axis=0)[:, None], state, somewhere)
-    return jax.vmap(initial_estimate, in_axes=(0, None))(elevation_bearing_range(state), params)[1]
+    return initial_estimate(elevation_bearing_range(state), params)[1]
 
 
 def _with_measurement(predicted: jax.Array, state: jax.Array, params: Params, irf: Scalar) -> jax.Array:

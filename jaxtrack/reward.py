@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from jaxtrack.metrics import gospa
 from jaxtrack.observation import covariance_norms
 from jaxtrack.params import Params, StaticParams
+from jaxtrack.scan_map import mean_scan_value
 from jaxtrack.types import NO_DETECTION, Tracks, Truths
 
 TrackTerm = Callable[[Tracks, Tracks, Truths, StaticParams, Params], jax.Array]
@@ -85,5 +86,5 @@ def reward_terms(
 ) -> tuple[jax.Array, jax.Array]:
     """Weighted track term and weighted search term (negative); the reward is their sum."""
     track = params.track_weight * TRACK_TERMS[static.reward](before, after, truths, static, params)
-    search = -params.search_weight * jnp.mean(scan_map)
+    search = -params.search_weight * mean_scan_value(scan_map)
     return track, search

@@ -1,9 +1,30 @@
-"""Numbers from uniform draws."""
+"""Random numbers, and choices among rows."""
 
 import jax
 import jax.numpy as jnp
 
+from jaxtrack.kernel import stage
 from jaxtrack.types import Scalar
+
+_LANES = 16
+"""Numbers a CPU works on at once: a draw of a multiple of them needs no slower rest."""
+
+
+def draw(key: jax.Array, num_normal: int, num_uniform: int) -> tuple[jax.Array, jax.Array]:
+    """Standard normal numbers and numbers uniform in [0, 1), in one long draw; the key is consumed.
+
+    Two short draws would cost more than the numbers themselves.
+    """
+    length = -(-(num_normal + num_uniform) // _LANES) * _LANES
+    numbers = stage(lambda key: _symmetric_uniform(key, length))(key)
+    normal = stage(lambda uniform: jnp.sqrt(2.0).astype(uniform.dtype) * jax.lax.erf_inv(uniform))
+    return normal(numbers[:num_normal]), (numbers[num_normal : num_normal + num_uniform] + 1) / 2
+
+
+def _symmetric_uniform(key: jax.Array, length: int) -> jax.Array:
+    """Uniform in (-1, 1), where the normal distribution's quantile is finite."""
+    one = jnp.ones(())
+    return jax.random.uniform(key, (length,), minval=jnp.nextafter(-one, one), maxval=one)
 
 
 def poisson_quantile(uniform: jax.Array, rate: Scalar, largest: int) -> jax.Array:
@@ -20,3 +41,19 @@ def poisson_quantile(uniform: jax.Array, rate: Scalar, largest: int) -> jax.Arra
     number = jnp.sum(uniform >= jnp.cumsum(terms))
     # Rounding of the last sums must not count anything where the rate is zero.
     return jnp.where(rate > 0, number, 0)
+
+
+def places(chosen: jax.Array) -> jax.Array:
+    """`[R]` how many rows before each one are chosen `[R]`: the place of a chosen row among them."""
+    rows = jnp.arange(chosen.shape[0])
+    return jnp.sum(chosen & (rows < rows[:, None]), axis=1)
+
+
+def matches(takers: jax.Array, taken: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Gives the k-th chosen row of `taken` `[S]` to the k-th chosen row of `takers` `[R]`.
+
+    Returns:
+        `[R]` whether the taker gets a row, and `[R]` which one (0 if none).
+    """
+    pairs = takers[:, None] & taken & (places(takers)[:, None] == places(taken))
+    return jnp.any(pairs, axis=1), jnp.argmax(pairs, axis=1)

@@ -7,6 +7,7 @@ The paper names a scan value without a formula (it points to arXiv 2502.13584). 
 import jax
 import jax.numpy as jnp
 
+from jaxtrack.kernel import stage
 from jaxtrack.models import direction
 from jaxtrack.params import Params, StaticParams
 from jaxtrack.sensor import in_beam, look_angles
@@ -20,12 +21,45 @@ def initial_scan_map(static: StaticParams) -> jax.Array:
 def update_scan_map(scan_map: jax.Array, look: jax.Array, static: StaticParams, params: Params) -> jax.Array:
     """Ages the map `[M, M]` by one time step and clears the dwell of a look `[2]` (rad)."""
     aged = 1 - (1 - scan_map) * jnp.exp(-params.time_step / params.scan_time_constant)
-    return jnp.where(in_beam(pixel_directions(static, params), look, params), 0.0, aged)
+    return jnp.where(pixels_in_beam(look, static, params), 0.0, aged)
+
+
+def mean_scan_value(scan_map: jax.Array) -> jax.Array:
+    """Mean `[]` of a map `[M, M]`."""
+    # Rows first: neighbouring numbers can be added at once, a single sum goes one by one.
+    return jnp.mean(jnp.mean(scan_map, axis=0))
+
+
+def pixels_in_beam(look: jax.Array, static: StaticParams, params: Params) -> jax.Array:
+    """`[M, M]` whether a pixel lies in the beam of a look `[2]` (rad): `in_beam` of `pixel_directions`.
+
+    Of a grid only the angles of its rows and columns need sines and cosines.
+    """
+    ahead, aside, sine, cosine = _grid_directions(grid_angles(static, params), look[0])
+    look_sine, look_cosine = jnp.sin(look[1]), jnp.cos(look[1])
+    forward = cosine[:, None] * ahead
+    x = look_cosine * forward + (look_sine * sine)[:, None]
+    y = cosine[:, None] * aside
+    z = (look_cosine * sine)[:, None] - look_sine * forward
+    half_bearing, half_elevation = params.beam_azimuth / 2, params.beam_elevation / 2
+    in_bearing = jnp.abs(y) * jnp.cos(half_bearing) <= jnp.sin(half_bearing) * x
+    return in_bearing & (jnp.abs(z) <= jnp.sin(half_elevation))
+
+
+@stage
+def _grid_directions(angles: jax.Array, azimuth: jax.Array) -> tuple[jax.Array, ...]:
+    """Of columns: cosine and sine `[M]` of the azimuth less the look's. Of rows: sine and cosine `[M]`."""
+    return jnp.cos(angles - azimuth), jnp.sin(angles - azimuth), jnp.sin(angles), jnp.cos(angles)
+
+
+def grid_angles(static: StaticParams, params: Params) -> jax.Array:
+    """Angles `[M]` (rad) of the map's rows and columns; the outermost lie on the edge of the field."""
+    return params.field_limit * jnp.linspace(-1.0, 1.0, static.map_size)
 
 
 def pixel_directions(static: StaticParams, params: Params) -> jax.Array:
-    """Unit vectors `[M, M, 3]` of the pixels; the outermost lie on the edge of the field."""
-    angles = params.field_limit * jnp.linspace(-1.0, 1.0, static.map_size)
+    """Unit vectors `[M, M, 3]` of the pixels."""
+    angles = grid_angles(static, params)
     azimuth, elevation = jnp.meshgrid(angles, angles)
     return direction(azimuth, elevation)
 

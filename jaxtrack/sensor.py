@@ -8,9 +8,9 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from jaxtrack.models import direction, spherical, wrap_detection
+from jaxtrack.models import direction, measurement_sigmas, spherical, wrap_detection
 from jaxtrack.params import Params, StaticParams
-from jaxtrack.sampling import poisson_quantile
+from jaxtrack.sampling import draw, matches, poisson_quantile
 from jaxtrack.types import NO_TRUTH, Detections, Truths, position
 
 
@@ -32,11 +32,10 @@ class SensorNoise(struct.PyTreeNode):
 
 def sample_noise(key: jax.Array, static: StaticParams) -> SensorNoise:
     """Draws all that is random in one look; the key is consumed."""
-    key_normal, key_uniform = jax.random.split(key)
     n, c = static.num_truths, static.max_clutter
-    uniform = jax.random.uniform(key_uniform, (n + 1 + 3 * c,))
+    normal, uniform = draw(key, 3 * n, n + 1 + 3 * c)
     return SensorNoise(
-        detection=jax.random.normal(key_normal, (n, 3)),
+        detection=normal.reshape(n, 3),
         detected=uniform[:n],
         clutter_count=uniform[n],
         clutter=uniform[n + 1 :].reshape(c, 3),
@@ -114,12 +113,21 @@ def detect(
     Returns:
         The detections, and how many found no slot or exceeded `max_clutter`.
     """
-    sigmas = jnp.array([params.elevation_sigma, params.bearing_sigma, params.range_sigma], dtype=float)
-    points = position(truths.state)
-    seen = truths.alive & in_beam(points, look, params)
+    seen = truths.alive & in_beam(position(truths.state), look, params)
     seen &= noise.detected < params.detection_probability
-    value = wrap_detection(spherical(points) + sigmas * noise.detection)
+    return jax.lax.cond(
+        jnp.any(seen) | (params.clutter_rate > 0),
+        lambda: _measure(truths, seen, look, noise, static, params),
+        lambda: (Detections.none(static.max_detections), jnp.asarray(0)),
+    )
 
+
+def _measure(
+    truths: Truths, seen: jax.Array, look: jax.Array, noise: SensorNoise, static: StaticParams, params: Params
+) -> tuple[Detections, jax.Array]:
+    """Detections of the truths seen `[N]` and of clutter, and how many were lost."""
+    points = spherical(position(truths.state))
+    value = wrap_detection(points + measurement_sigmas(params) * noise.detection)
     num_clutter, excess = clutter_count(noise.clutter_count, static, params)
     is_clutter = jnp.arange(static.max_clutter) < num_clutter
     false_value = spherical(clutter_points(noise.clutter, look, params))
@@ -151,16 +159,10 @@ def _compact(
     value: jax.Array, active: jax.Array, truth: jax.Array, capacity: int
 ) -> tuple[Detections, jax.Array]:
     """Moves the active rows to the front, keeps `capacity` of them, counts the rest."""
-    rows = active.shape[0]
-    if rows < capacity:
-        padding = capacity - rows
-        value = jnp.pad(value, ((0, padding), (0, 0)))
-        active, truth = jnp.pad(active, (0, padding)), jnp.pad(truth, (0, padding))
-    order = jnp.argsort(~active, stable=True)[:capacity]
-    kept = active[order]
+    kept, source = matches(jnp.ones(capacity, dtype=bool), active)
     detections = Detections(
-        value=jnp.where(kept[:, None], value[order], 0.0),
+        value=jnp.where(kept[:, None], value[source], 0.0),
         active=kept,
-        truth=jnp.where(kept, truth[order], NO_TRUTH),
+        truth=jnp.where(kept, truth[source], NO_TRUTH),
     )
     return detections, jnp.sum(active) - jnp.sum(kept)

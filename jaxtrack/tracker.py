@@ -61,14 +61,18 @@ def step(
     """
     tracks, detections = _blank_empty_rows(tracks, detections, params)
     predicted = kalman.predict(tracks, time_step, params)
-    expected = kalman.predict_detections(predicted, params)
-    distances = measure(expected, detections, params)
-    admissible = association.gate(distances, predicted, detections, params)
-    associated = association.associate_nearest_neighbour(admissible)
-    updated = kalman.update(predicted, expected, detections, associated)
+    expected, distances, associated, updated = jax.lax.cond(
+        jnp.any(detections.active),
+        lambda: _associate_and_update(predicted, detections, params, measure),
+        lambda: _coast(predicted, detections, params, measure),
+    )
     surviving = lifecycle.delete_uncertain_tracks(updated, params)
     new = lifecycle.unassociated(detections, associated)
-    tracks, num_dropped = lifecycle.initiate_tracks(surviving, detections, new, index, params)
+    tracks, num_dropped = jax.lax.cond(
+        jnp.any(new),
+        lambda: lifecycle.initiate_tracks(surviving, detections, new, index, params),
+        lambda: (surviving, jnp.asarray(0)),
+    )
     return tracks, TrackerInfo(
         predicted=predicted,
         expected=expected,
@@ -81,12 +85,32 @@ def step(
     )
 
 
+_Update = tuple[kalman.ExpectedDetections, jax.Array, jax.Array, Tracks]
+"""Expectations, distances `[T, D]`, associations `[T]`, and the updated track list."""
+
+
+def _associate_and_update(
+    predicted: Tracks, detections: Detections, params: Params, measure: Measure
+) -> _Update:
+    expected = kalman.predict_detections(predicted, params)
+    distances = measure(expected, detections, params)
+    admissible = association.gate(distances, predicted, detections, params)
+    associated = association.associate_nearest_neighbour(admissible)
+    return expected, distances, associated, kalman.update(predicted, expected, detections, associated)
+
+
+def _coast(predicted: Tracks, detections: Detections, params: Params, measure: Measure) -> _Update:
+    """`_associate_and_update` without a detection; costs nothing where no one asks for its details."""
+    expected = kalman.predict_detections(predicted, params)
+    return expected, measure(expected, detections, params), predicted.updated_by, predicted
+
+
 def _blank_empty_rows(tracks: Tracks, detections: Detections, params: Params) -> tuple[Tracks, Detections]:
     """Puts harmless numbers into empty rows, so that neither values nor gradients turn NaN."""
-    somewhere = jnp.zeros(STATE_DIM).at[0].set(params.min_range)
+    somewhere = params.min_range * jnp.eye(STATE_DIM)[0]
     tracks = tracks.replace(
         mean=where_rows(tracks.active, tracks.mean, somewhere),
         covariance=where_rows(tracks.active, tracks.covariance, jnp.eye(STATE_DIM)),
     )
-    origin = jnp.zeros(3).at[2].set(params.min_range)
+    origin = params.min_range * jnp.eye(3)[2]
     return tracks, detections.replace(value=where_rows(detections.active, detections.value, origin))

@@ -7,10 +7,10 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from jaxtrack.models import constant_velocity, direction
+from jaxtrack.models import direction, interleave
 from jaxtrack.params import Params, StaticParams
-from jaxtrack.sampling import poisson_quantile
-from jaxtrack.types import Scalar, Truths
+from jaxtrack.sampling import draw, poisson_quantile
+from jaxtrack.types import Scalar, Truths, position, velocity
 
 MOST_BIRTHS = 4
 """Births of one step are cut off at this many times the number of rows."""
@@ -31,11 +31,10 @@ class TruthNoise(struct.PyTreeNode):
     birth_count: jax.Array  # []
 
 
-def sample_truth_noise(key: jax.Array, key_life: jax.Array, num_truths: int) -> TruthNoise:
-    """Draws all that is random in one step of the truths; both keys are consumed."""
-    uniform = jax.random.uniform(key_life, (num_truths + 1,))
-    motion = jax.random.normal(key, (num_truths, 3, 2))
-    return TruthNoise(motion=motion, death=uniform[:-1], birth_count=uniform[-1])
+def sample_truth_noise(key: jax.Array, num_truths: int) -> TruthNoise:
+    """Draws all that is random in one step of the truths; the key is consumed."""
+    normal, uniform = draw(key, 6 * num_truths, num_truths + 1)
+    return TruthNoise(normal.reshape(num_truths, 3, 2), uniform[:-1], uniform[-1])
 
 
 def initiate_truths(key: jax.Array, static: StaticParams, params: Params) -> Truths:
@@ -90,7 +89,11 @@ def propagate_truths(
         return replay_truths(step, params), num_born, jnp.zeros_like(num_born)
     surviving = end_truths(truths, noise.death, params)
     moved = move_truths(surviving, noise.motion, params)
-    truths, num_wanted = begin_truths(moved, num_born, noise, params)
+    truths, num_wanted = jax.lax.cond(
+        jnp.asarray(params.birth_rate) > 0,
+        lambda: begin_truths(moved, num_born, noise, params),
+        lambda: (moved, num_born),
+    )
     rows = truths.alive.shape[0]
     return truths, num_wanted, jnp.maximum(num_wanted, rows) - jnp.maximum(num_born, rows)
 
@@ -105,10 +108,15 @@ def end_truths(truths: Truths, uniform: jax.Array, params: Params) -> Truths:
 
 def move_truths(truths: Truths, noise: jax.Array, params: Params) -> Truths:
     """Moves the truths by one time step; `noise` `[N, 3, 2]` is standard normal."""
-    F, _ = constant_velocity(params.time_step, 0.0)
     factor = process_noise_factor(params.time_step, params.truth_process_noise)
-    shaken = jnp.einsum("ij,naj->nai", factor, noise).reshape(truths.state.shape)
-    return truths.replace(state=jnp.einsum("ij,nj->ni", F, truths.state) + shaken)
+    p, v = position(truths.state), velocity(truths.state)
+    first, second = noise[..., 0], noise[..., 1]
+    return truths.replace(
+        state=interleave(
+            p + params.time_step * v + factor[0, 0] * first,
+            v + factor[1, 0] * first + factor[1, 1] * second,
+        )
+    )
 
 
 def begin_truths(

@@ -64,6 +64,12 @@ class Detections(struct.PyTreeNode):
         active = jnp.ones(rows, dtype=bool) if active is None else jnp.asarray(active)
         return cls(value=value, active=active, truth=jnp.full(rows, NO_TRUTH, dtype=int))
 
+    @classmethod
+    def none(cls, max_detections: int) -> "Detections":
+        """No detections in `max_detections` rows."""
+        rows = jnp.zeros(max_detections, dtype=bool)
+        return cls.from_values(jnp.zeros((max_detections, DETECTION_DIM)), rows)
+
 
 class Tracks(struct.PyTreeNode):
     """Track list, capacity T. A track keeps its slot for life.

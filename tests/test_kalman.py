@@ -13,8 +13,6 @@ from jaxtrack.models import constant_velocity
 MEANS = np.array([[3000.0, 10, 900, -5, 1200, 3], [-2000, 0, 5, 40, -600, 9], [1500, -7, -1500, 1, 20, 4]])
 predict = jax.jit(kalman.predict)
 predict_detections = jax.jit(kalman.predict_detections)
-cholesky = jax.jit(kalman.cholesky)
-inverse_3x3 = jax.jit(kalman.inverse_3x3)
 
 
 @jax.jit
@@ -49,33 +47,6 @@ def textbook_unscented(mean, P, params):
     D[:, :2] = np.angle(np.exp(1j * D[:, :2]))
     R = np.diag([params.elevation_sigma, params.bearing_sigma, params.range_sigma]) ** 2
     return z, (w_cov * D.T) @ D + R, (w_cov * (points - mean).T) @ D
-
-
-@given(st.integers(0, 10_000), st.sampled_from([1, 2, 3, 6]))
-def test_cholesky_equals_numpys(x64, seed, size):
-    matrix = spd(seed, size, 10.0 ** np.arange(size))
-    np.testing.assert_allclose(cholesky(matrix), np.linalg.cholesky(matrix), rtol=1e-9)
-
-
-def test_cholesky_reads_the_lower_triangle_only():
-    matrix = spd(0, 6)
-    lower_only = np.tril(matrix) + np.triu(np.full((6, 6), 7.0), 1)
-    np.testing.assert_array_equal(cholesky(lower_only), cholesky(matrix))
-
-
-def test_cholesky_of_an_indefinite_matrix_is_nan():
-    assert bool(jnp.any(jnp.isnan(cholesky(jnp.diag(jnp.array([1.0, -1.0, 1.0]))))))
-
-
-@given(st.integers(0, 10_000))
-def test_inverse_3x3_equals_numpys_in_any_units(x64, seed):
-    matrix = spd(seed, 3, np.array([1e-3, 1e-3, 10.0]))
-    np.testing.assert_allclose(inverse_3x3(matrix), np.linalg.inv(matrix), rtol=1e-8)
-
-
-def test_inverse_3x3_needs_no_symmetry(x64):
-    matrix = np.array([[1.0, 2, 3], [0, 1, 4], [5, 6, 0]])
-    np.testing.assert_allclose(inverse_3x3(matrix), [[-24, 18, 5], [20, -15, -4], [-5, 4, 1]], rtol=1e-12)
 
 
 def test_prediction_is_the_textbooks(tracks_at, x64):

@@ -16,7 +16,15 @@ wrap_bearing = jax.jit(models.wrap_bearing)
 fold_elevation = jax.jit(models.fold_elevation)
 measure = jax.jit(models.elevation_bearing_range)
 measure_points = jax.jit(models.spherical)
-spherical_offsets = jax.jit(models.spherical_offsets)
+
+
+@jax.jit
+def spherical_offsets(centre, displacement):
+    """Sines `[K, 2]`, cosines `[K, 2]` and ranges `[K]` of displacements `[K, 3]`."""
+    changes = models.spherical_offsets(centre, jnp.moveaxis(displacement, -1, 0))
+    return jnp.stack(changes[:4:2], axis=-1), jnp.stack(changes[1:4:2], axis=-1), changes[4]
+
+
 locate = jax.jit(models.inverse_elevation_bearing_range)
 inverse_jacobian = jax.jit(models.inverse_jacobian)
 

@@ -9,7 +9,7 @@ from scipy.stats import chi2
 
 from jaxtrack import metrics
 from jaxtrack.env import EnvState, SearchTrack, StepRecord
-from jaxtrack.kalman import inverse_3x3
+from jaxtrack.matrices import inverse_3x3
 from jaxtrack.params import Params, StaticParams
 from jaxtrack.reward import reward_terms
 from jaxtrack.sensor import look_indices

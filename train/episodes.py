@@ -100,7 +100,7 @@ def play_episodes(
 
         def one_step(state: EnvState, key: jax.Array) -> tuple[EnvState, StepRow]:
             action = act(key_policy, state)
-            after, record = env.advance(state, action, env.sample_noise(key), params)
+            after, record = env.play(key, state, action, params)
             return after, step_row(state, after, record, env, params)
 
         rows = jax.lax.scan(one_step, start, jax.random.split(key_noise, length))[1]

@@ -71,7 +71,7 @@ def ours_and_theirs():
             "episode_values",
             lambda rows, params: right_values(rows, params) | {"record": (rows.truths, rows.tracks)},
         )
-        keys = jax.random.split(jax.random.key(11), EPISODES)
+        keys = jax.random.split(jax.random.key(12), EPISODES)
         played = [jax.device_get(play(keys, jnp.asarray(which)))[:2] for which in range(len(CHOSEN))]
     found = []
     for values, curves in played:

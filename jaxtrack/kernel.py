@@ -1,0 +1,88 @@
+"""How a CPU steps one scenario after the other, all in one piece of machine code.
+
+XLA runs a program on a CPU as a list of small kernels, and to start one costs as much as the
+arithmetic of a whole step of one scenario. A mark that other devices ignore makes it compile a
+loop as a single kernel, in which `jax.lax.cond` is a real branch: a look at an empty sky
+updates no track.
+
+Such a kernel can not hold what XLA leaves to libraries: sorts, scatters, matrix products and
+large sums. `add_up` and `jaxtrack.sampling.places` stand in for them.
+"""
+
+import functools
+import operator
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax.custom_batching import custom_vmap
+from jax.experimental.xla_metadata import set_xla_metadata
+
+Function = Callable[..., Any]
+
+_ONE_KERNEL = {"inlineable": "false", "xla_cpu_small_call": "true"}
+_NOT_INLINED = {"inlineable": "false"}
+_NO_MARK = dict.fromkeys(_ONE_KERNEL)
+
+
+def one_by_one(function: Function) -> Function:
+    """`function` of arrays, which `jax.vmap` runs for one row after the other instead of for all at once.
+
+    Only on a CPU; for other devices `function` is left as it is.
+    """
+    if jax.default_backend() != "cpu":
+        return function
+    looped = custom_vmap(function)
+
+    @looped.def_vmap
+    def in_a_loop(size: int, batched: list[Any], *arguments: Any) -> tuple[Any, Any]:
+        del size
+        leaves, tree = jax.tree.flatten(arguments)
+        varies = jax.tree.leaves(tuple(batched))
+
+        def loop(*leaves: jax.Array) -> Any:
+            def one(row: list[jax.Array]) -> Any:
+                rest = iter(row)
+                merged = [next(rest) if each else leaf for leaf, each in zip(leaves, varies, strict=True)]
+                return function(*jax.tree.unflatten(tree, merged))
+
+            return jax.lax.map(one, [leaf for leaf, each in zip(leaves, varies, strict=True) if each])
+
+        result = _call(loop, leaves, _ONE_KERNEL)
+        return result, jax.tree.map(lambda _: True, result)
+
+    return looped
+
+
+def stage(function: Function) -> Function:
+    """`function` of arrays, worked out once however many results need it.
+
+    XLA for CPUs would rather repeat arithmetic for every result that needs it; it does not look
+    into a function that is called instead of inlined.
+    """
+
+    @functools.wraps(function)
+    def staged(*arguments: Any) -> Any:
+        return _call(function, arguments, _NOT_INLINED)
+
+    return staged
+
+
+def add_up(terms: jax.Array, axis: int = 0) -> jax.Array:
+    """Sum over a short axis, written out term by term."""
+    return functools.reduce(operator.add, jnp.unstack(terms, axis=axis))
+
+
+def _call(function: Function, arguments: Any, marks: dict[str, str]) -> Any:
+    """Calls `function` as one marked HLO call."""
+
+    def called(*arguments: Any) -> Any:
+        # The marks are for the call alone, not for all that it holds.
+        with set_xla_metadata(**_NO_MARK):
+            return function(*arguments), arguments
+
+    with set_xla_metadata(**marks):
+        result, echo = jax.jit(called)(*arguments)
+    # All arguments are returned: XLA ends the process over one that it found to be of no use.
+    return jax.lax.optimization_barrier((result, echo))[0] if marks == _ONE_KERNEL else result

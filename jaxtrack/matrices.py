@@ -1,0 +1,59 @@
+"""Linear algebra of many small matrices at once: `[m, n, ...]`, whatever follows is the batch.
+
+The batch comes last, so that neighbouring numbers take the same operations, and everything is
+written out: for matrices this small, calling a library costs more than the arithmetic.
+"""
+
+import jax
+import jax.numpy as jnp
+
+from jaxtrack.kernel import add_up
+
+
+def cholesky(matrix: jax.Array) -> jax.Array:
+    """Lower Cholesky factors of matrices `[n, n, ...]` from their lower triangles, column by column.
+
+    NaN where a matrix is not positive definite.
+    """
+    columns: list[jax.Array] = []
+    for j in range(matrix.shape[0]):
+        # Column k of the factor is kept from its diagonal down.
+        reduced = matrix[j:, j] - sum(column[j - k :] * column[j - k] for k, column in enumerate(columns))
+        columns.append(reduced / jnp.sqrt(reduced[0]))
+    above = [jnp.zeros_like(matrix[:k, 0]) for k in range(matrix.shape[0])]
+    return jnp.stack([jnp.concatenate(pair) for pair in zip(above, columns, strict=True)], axis=1)
+
+
+def inverse_3x3(matrix: jax.Array) -> jax.Array:
+    """Inverses of matrices `[3, 3, ...]` by cofactors, which is exact under scaling of units."""
+    adjugate = _adjugate(matrix)
+    return adjugate / add_up(matrix[0] * adjugate[:, 0])
+
+
+def determinant_3x3(matrix: jax.Array) -> jax.Array:
+    """Determinants `[...]` of matrices `[3, 3, ...]` by cofactors."""
+    return add_up(matrix[0] * _adjugate(matrix)[:, 0])
+
+
+def product(a: jax.Array, b: jax.Array) -> jax.Array:
+    """Matrix products `[m, n, ...]` of `[m, k, ...]` and `[k, n, ...]`."""
+    return add_up(a[:, :, None] * b[None], axis=1)
+
+
+def batch_last(batch: jax.Array) -> jax.Array:
+    """`[m, ..., B]` of `[B, m, ...]`."""
+    return jnp.moveaxis(batch, 0, -1)
+
+
+def batch_first(batch: jax.Array) -> jax.Array:
+    """`[B, m, ...]` of `[m, ..., B]`."""
+    return jnp.moveaxis(batch, -1, 0)
+
+
+def _adjugate(matrix: jax.Array) -> jax.Array:
+    a, b, c = matrix
+    return jnp.stack([_cross(b, c), _cross(c, a), _cross(a, b)], axis=1)
+
+
+def _cross(a: jax.Array, b: jax.Array) -> jax.Array:
+    return jnp.stack([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
