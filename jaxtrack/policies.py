@@ -18,7 +18,7 @@ import jax.numpy as jnp
 
 from jaxtrack.models import elevation_bearing_range
 from jaxtrack.params import Params, StaticParams
-from jaxtrack.scan_map import beam_weights, look_grid
+from jaxtrack.scan_map import beam_means, look_grid
 from jaxtrack.sensor import in_beam, look_indices
 from jaxtrack.types import Tracks, position
 
@@ -70,11 +70,11 @@ def coverage(static: StaticParams, params: Params) -> Policy:
 
 def stalest(static: StaticParams, params: Params) -> Policy:
     """The look whose beam has the largest mean scan value."""
-    weights = beam_weights(static, params)
+    scan_values = beam_means(static, params)
 
     def policy(key: jax.Array, state: "EnvState") -> jax.Array:
         del key
-        return to_action(jnp.argmax(weights @ state.scan_map.ravel()), static, params)
+        return to_action(jnp.argmax(scan_values(state.scan_map)), static, params)
 
     return policy
 
@@ -89,14 +89,14 @@ def scheduler(
         params: numbers.
         revisit_share: share of the deletion threshold from which a trace is urgent.
     """
-    weights = beam_weights(static, params)
+    scan_values = beam_means(static, params)
 
     def policy(key: jax.Array, state: "EnvState") -> jax.Array:
         del key
         share = trace_share(state.tracks, params)
         worst = jnp.argmax(share)
         towards_track = nearest_look(state.tracks.mean[worst], static, params)
-        stalest_look = jnp.argmax(weights @ state.scan_map.ravel())
+        stalest_look = jnp.argmax(scan_values(state.scan_map))
         index = jnp.where(share[worst] > revisit_share, towards_track, stalest_look)
         return to_action(index, static, params)
 
@@ -121,14 +121,14 @@ def index(
         exponent: power of each trace / deletion threshold.
         scan_weight: weight of the mean scan value.
     """
-    weights = beam_weights(static, params)
+    scan_values = beam_means(static, params)
     looks = look_grid(static, params)
 
     def policy(key: jax.Array, state: "EnvState") -> jax.Array:
         del key
         inside = tracks_in_beams(state.tracks, looks, params)
         urgency = inside @ trace_share(state.tracks, params) ** exponent
-        value = scan_weight * (weights @ state.scan_map.ravel()) + urgency
+        value = scan_weight * scan_values(state.scan_map) + urgency
         return to_action(jnp.argmax(value), static, params)
 
     return policy

@@ -4,6 +4,8 @@ The paper names a scan value without a formula (it points to arXiv 2502.13584). 
 ``1 - exp(-(t - t_last look) / tau)``: 1 where never seen, 0 inside the dwell just made.
 """
 
+from collections.abc import Callable
+
 import jax
 import jax.numpy as jnp
 
@@ -11,6 +13,9 @@ from jaxtrack.kernel import stage
 from jaxtrack.models import direction
 from jaxtrack.params import Params, StaticParams
 from jaxtrack.sensor import in_beam, look_angles
+
+BAND_SHARE = 6
+"""`beam_means` takes the short way if no beam crosses more than this part of the map's rows."""
 
 
 def initial_scan_map(static: StaticParams) -> jax.Array:
@@ -80,3 +85,28 @@ def beam_weights(static: StaticParams, params: Params) -> jax.Array:
     pixels = pixel_directions(static, params).reshape(-1, 3)
     inside = jax.vmap(in_beam, in_axes=(None, 0, None))(pixels, look_grid(static, params), params)
     return inside / jnp.maximum(inside.sum(axis=-1, keepdims=True), 1)
+
+
+def beam_means(static: StaticParams, params: Params) -> Callable[[jax.Array], jax.Array]:
+    """The function of a map `[M, M]` that gives the mean scan value in the beam of every look `[L * L]`.
+
+    `beam_weights` times the map. A beam crosses few rows of the map, the same for all looks of
+    one elevation: where they are at most a sixth, only those are multiplied.
+    """
+    weights = beam_weights(static, params)
+    looks, pixels = static.num_looks, static.map_size
+    grid = weights.reshape(looks, looks, pixels, pixels)  # azimuth, elevation, row, column
+    crossed = jnp.any(grid > 0, axis=(0, 3))
+    band = -(-pixels // BAND_SHARE)
+    rows = jnp.minimum(jnp.argmax(crossed, axis=1), pixels - band)[:, None] + jnp.arange(band)
+    elevation = jnp.arange(looks)[:, None]
+    banded = grid[:, elevation, rows]
+    enough = jnp.sum(crossed[elevation, rows]) == jnp.sum(crossed)
+
+    def of_crossed_rows(scan_map: jax.Array) -> jax.Array:
+        return jnp.einsum("aerc,erc->ae", banded, scan_map[rows]).ravel()
+
+    def of_all_rows(scan_map: jax.Array) -> jax.Array:
+        return weights @ scan_map.ravel()
+
+    return lambda scan_map: jax.lax.cond(enough, of_crossed_rows, of_all_rows, scan_map)

@@ -12,7 +12,7 @@ from flax import struct
 from jaxtrack.models import direction
 from jaxtrack.observation import Observation
 from jaxtrack.params import Params, StaticParams
-from jaxtrack.scan_map import beam_weights, look_grid
+from jaxtrack.scan_map import beam_means, look_grid
 from jaxtrack.sensor import in_beam
 
 LOGIT_SCALE = 10.0
@@ -41,7 +41,7 @@ class CellGeometry:
         self.params = params
         self.looks = look_grid(static, params)
         self.boresights = direction(self.looks[:, 0], self.looks[:, 1])
-        self.beam_weights = beam_weights(static, params)
+        self.scan_values = beam_means(static, params)
 
     def __call__(self, observation: Observation) -> CellInputs:
         """Inputs of one observation (no batch dimension)."""
@@ -56,7 +56,7 @@ class CellGeometry:
         inside = jnp.where(mask, inside, False)
         chord = jnp.sqrt(jnp.maximum(2 - 2 * self.boresights @ towards.T, 0.0))
         closeness = jnp.clip(1 - chord / self.params.beam_azimuth, 0.0, 1.0)
-        scan_value = self.beam_weights @ observation["scan_map"].ravel()
+        scan_value = self.scan_values(observation["scan_map"])
         cells = jnp.stack(
             [
                 scan_value,
