@@ -1,5 +1,10 @@
 """Steps per second of our environment and of Stone Soup's: `python -m benchmarks.environment`."""
 
+from jaxtrack import cores
+
+if __name__ == "__main__":
+    cores.use()  # before gymnax is imported, which starts JAX
+
 import dataclasses
 import json
 import sys
@@ -77,14 +82,16 @@ def time_ours(
 ) -> Timing:
     """Plays the same piece of an episode with fresh noise until the time is over."""
     seconds, detections, live_tracks = 0.0, list[float](), list[float]()
+    num_envs = start[1].time.shape[0]
     while seconds < options.min_seconds or not detections:
-        key = jax.block_until_ready(jax.random.fold_in(key, len(detections)))
+        key = jax.random.fold_in(key, len(detections))
+        keys = jax.block_until_ready(jax.random.split(key, num_envs))
         began = time.perf_counter()
-        _, logged = jax.block_until_ready(compiled(key, start, params))
+        _, logged = jax.block_until_ready(compiled(keys, start, params))
         seconds += time.perf_counter() - began
-        detections.append(float(logged["num_detections"]))
-        live_tracks.append(float(logged["live_tracks"]))
-    steps = len(detections) * options.steps * start[1].time.shape[0]
+        detections.append(float(logged["num_detections"].mean()))
+        live_tracks.append(float(logged["live_tracks"].mean()))
+    steps = len(detections) * options.steps * num_envs
     return Timing(steps / seconds, float(np.mean(detections)), float(np.mean(live_tracks)))
 
 
@@ -193,7 +200,7 @@ def main(argv: Sequence[str]) -> int:
     machine = report["machine"]
     title = (
         f"median of {options.repeats} repeats (smallest - largest); pairs are jaxtrack / Stone Soup; "
-        f"{machine['processor']}, {machine['cores']} cores, {machine['jax_backend']}"
+        f"{machine['processor']}, {jax.device_count()} of {machine['cores']} cores, {machine['jax_backend']}"
     )
     print_table(HEADER, [cells(row) for row in rows], title, options.markdown, console)
     if options.out is not None:

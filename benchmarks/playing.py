@@ -6,7 +6,7 @@ from typing import Any, TypeVar
 import jax
 import jax.numpy as jnp
 
-from jaxtrack import policies
+from jaxtrack import cores, policies
 from jaxtrack.env import EnvState, SearchTrack
 from jaxtrack.observation import Observation
 from jaxtrack.params import Params, StaticParams
@@ -28,23 +28,22 @@ def pointing(static: StaticParams, params: Params) -> policies.Policy:
 
 
 def play(
-    key: jax.Array,
+    keys: jax.Array,
     start: Start,
     params: Params,
     env: SearchTrack,
     build: policies.PolicyBuilder,
     steps: int,
 ) -> tuple[Start, dict[str, jax.Array]]:
-    """Steps the environments of `start` `[B]` together, through gymnax's `step`.
+    """Steps the environments of `start` `[B]`, each with its key of `keys` `[B]`, through gymnax's `step`.
 
     Returns:
-        The last observation and state, and the means of reward and of every scalar of `info`:
-        all of them are asked for, so that none is optimised away.
+        The last observation and state, and the means `[B]` of reward and of every scalar of
+        `info`: all of them are asked for, so that none is optimised away.
     """
     policy = build(env.static, params)
-    num_envs = start[1].time.shape[0]
-    key_policy, key_steps = jax.random.split(key)
-    policy_keys = jax.random.split(key_policy, num_envs)
+    policy_keys, step_keys = jnp.moveaxis(jax.vmap(jax.random.split)(keys), 1, 0)
+    of_steps = jax.vmap(lambda key: jax.random.split(key, steps), out_axes=1)(step_keys)
 
     def one_step(carry: Start, keys: jax.Array) -> tuple[Start, dict[str, jax.Array]]:
         _, state = carry
@@ -53,29 +52,38 @@ def play(
             keys, state, action, params
         )
         del info["final_observation"]
-        return (observation, state), jax.tree.map(jnp.mean, {**info, "reward": reward})
+        return (observation, state), {**info, "reward": reward}
 
-    end, logged = jax.lax.scan(one_step, start, jax.random.split(key_steps, (steps, num_envs)))
-    return end, jax.tree.map(jnp.mean, logged)
+    end, logged = jax.lax.scan(one_step, start, of_steps)
+    return end, jax.tree.map(lambda values: jnp.mean(values, axis=0), logged)
 
 
 def raster(key: jax.Array, params: Params, env: SearchTrack, num_envs: int) -> Start:
     """New scenarios `[B]` after one raster over the field, so that tracks exist."""
-    key_reset, key_play = jax.random.split(key)
-    start = jax.vmap(env.reset, in_axes=(0, None))(jax.random.split(key_reset, num_envs), params)
-    return play(key_play, start, params, env, policies.coverage, env.static.num_looks**2)[0]
+    reset_keys, play_keys = jax.random.split(key, (2, num_envs))
+    start = jax.vmap(env.reset, in_axes=(0, None))(reset_keys, params)
+    return play(play_keys, start, params, env, policies.coverage, env.static.num_looks**2)[0]
 
 
 def compile_play(
     env: SearchTrack, params: Params, start: Start, build: policies.PolicyBuilder, steps: int
 ) -> tuple[Any, float]:
-    """The compiled `play`, called once to warm up, and the seconds that tracing and compiling took."""
-    began = time.perf_counter()
-    jitted = jax.jit(lambda key, start, params: play(key, start, params, env, build, steps))
-    compiled = jitted.lower(jax.random.key(0), start, params).compile()
+    """The compiled `play` on all cores, called once to warm up, and the seconds that compiling took.
+
+    One environment, or a number that the cores can not share equally, is played on one core.
+    """
+
+    def function(keys: jax.Array, start: Start, params: Params) -> tuple[Start, dict[str, jax.Array]]:
+        return play(keys, start, params, env, build, steps)
+
+    num_envs = start[1].time.shape[0]
+    on_all = function if num_envs % jax.device_count() else cores.share_out(function, shared=1)
+    keys = jax.random.split(jax.random.key(0), num_envs)
+    jitted, began = jax.jit(on_all), time.perf_counter()
+    jitted.lower(keys, start, params).compile()
     seconds = time.perf_counter() - began
-    jax.block_until_ready(compiled(jax.random.key(0), start, params))
-    return compiled, seconds
+    jax.block_until_ready(jitted(keys, start, params))
+    return jitted, seconds
 
 
 def first(count: int, tree: Tree) -> Tree:

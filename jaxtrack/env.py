@@ -16,9 +16,16 @@ from jaxtrack.kernel import Function, one_by_one
 from jaxtrack.observation import TRACK_FEATURES, Observation, observe
 from jaxtrack.params import Params, StaticParams, check_trajectories, validate
 from jaxtrack.reward import reward_terms
+from jaxtrack.sampling import draw
 from jaxtrack.scan_map import initial_scan_map, mean_scan_value, update_scan_map
-from jaxtrack.sensor import SensorNoise, detect, look_angles, sample_noise
-from jaxtrack.truth import TruthNoise, initiate_truths, propagate_truths, sample_truth_noise
+from jaxtrack.sensor import SensorNoise, cut_noise, detect, look_angles, num_draws
+from jaxtrack.truth import (
+    TruthNoise,
+    cut_truth_noise,
+    initiate_truths,
+    num_truth_draws,
+    propagate_truths,
+)
 from jaxtrack.types import Detections, Tracks, Truths
 
 ENV_ID = "SearchTrack-v0"
@@ -205,9 +212,12 @@ class SearchTrack(environment.Environment[EnvState, Params]):
 
     def sample_noise(self, key: jax.Array) -> StepNoise:
         """Draws all that is random in one step; the key is consumed."""
-        key_truths, key_sensor = jax.random.split(key)
-        truths = sample_truth_noise(key_truths, self.static.num_truths)
-        return StepNoise(truths=truths, sensor=sample_noise(key_sensor, self.static))
+        for_truths, for_sensor = num_truth_draws(self.static.num_truths), num_draws(self.static)
+        # In one draw for both: short draws cost more than the numbers themselves.
+        normal, uniform = draw(key, *map(sum, zip(for_truths, for_sensor, strict=True)))
+        truths = cut_truth_noise(normal[: for_truths[0]], uniform[: for_truths[1]])
+        sensor = cut_noise(normal[for_truths[0] :], uniform[for_truths[1] :], self.static)
+        return StepNoise(truths=truths, sensor=sensor)
 
     def observe(
         self, key: jax.Array, state: EnvState, action: jax.Array | None, params: Params

@@ -11,10 +11,7 @@ _LANES = 16
 
 
 def draw(key: jax.Array, num_normal: int, num_uniform: int) -> tuple[jax.Array, jax.Array]:
-    """Standard normal numbers and numbers uniform in [0, 1), in one long draw; the key is consumed.
-
-    Two short draws would cost more than the numbers themselves.
-    """
+    """Standard normal numbers and numbers uniform in [0, 1), in one long draw; the key is consumed."""
     length = -(-(num_normal + num_uniform) // _LANES) * _LANES
     numbers = stage(lambda key: _symmetric_uniform(key, length))(key)
     normal = stage(lambda uniform: jnp.sqrt(2.0).astype(uniform.dtype) * jax.lax.erf_inv(uniform))

@@ -30,16 +30,25 @@ class SensorNoise(struct.PyTreeNode):
     clutter: jax.Array  # [C, 3]
 
 
-def sample_noise(key: jax.Array, static: StaticParams) -> SensorNoise:
-    """Draws all that is random in one look; the key is consumed."""
-    n, c = static.num_truths, static.max_clutter
-    normal, uniform = draw(key, 3 * n, n + 1 + 3 * c)
+def num_draws(static: StaticParams) -> tuple[int, int]:
+    """Standard normal and uniform numbers that one look takes."""
+    return 3 * static.num_truths, static.num_truths + 1 + 3 * static.max_clutter
+
+
+def cut_noise(normal: jax.Array, uniform: jax.Array, static: StaticParams) -> SensorNoise:
+    """The noise of one look from as many numbers as `num_draws` says."""
+    n = static.num_truths
     return SensorNoise(
         detection=normal.reshape(n, 3),
         detected=uniform[:n],
         clutter_count=uniform[n],
-        clutter=uniform[n + 1 :].reshape(c, 3),
+        clutter=uniform[n + 1 :].reshape(static.max_clutter, 3),
     )
+
+
+def sample_noise(key: jax.Array, static: StaticParams) -> SensorNoise:
+    """Draws all that is random in one look; the key is consumed."""
+    return cut_noise(*draw(key, *num_draws(static)), static)
 
 
 def look_angles(action: jax.Array, static: StaticParams, params: Params) -> jax.Array:

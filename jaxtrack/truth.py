@@ -31,10 +31,19 @@ class TruthNoise(struct.PyTreeNode):
     birth_count: jax.Array  # []
 
 
+def num_truth_draws(num_truths: int) -> tuple[int, int]:
+    """Standard normal and uniform numbers that one step of the truths takes."""
+    return 6 * num_truths, num_truths + 1
+
+
+def cut_truth_noise(normal: jax.Array, uniform: jax.Array) -> TruthNoise:
+    """The noise of one step from as many numbers as `num_truth_draws` says."""
+    return TruthNoise(motion=normal.reshape(-1, 3, 2), death=uniform[:-1], birth_count=uniform[-1])
+
+
 def sample_truth_noise(key: jax.Array, num_truths: int) -> TruthNoise:
     """Draws all that is random in one step of the truths; the key is consumed."""
-    normal, uniform = draw(key, 6 * num_truths, num_truths + 1)
-    return TruthNoise(normal.reshape(num_truths, 3, 2), uniform[:-1], uniform[-1])
+    return cut_truth_noise(*draw(key, *num_truth_draws(num_truths)))
 
 
 def initiate_truths(key: jax.Array, static: StaticParams, params: Params) -> Truths:
