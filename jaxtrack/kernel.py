@@ -23,7 +23,7 @@ Function = Callable[..., Any]
 
 _ONE_KERNEL = {"inlineable": "false", "xla_cpu_small_call": "true"}
 _NOT_INLINED = {"inlineable": "false"}
-_NO_MARK = dict.fromkeys(_ONE_KERNEL)
+_UNMARKED = {"inlineable": "true", "xla_cpu_small_call": "false"}
 
 
 def one_by_one(function: Function) -> Function:
@@ -78,8 +78,8 @@ def _call(function: Function, arguments: Any, marks: dict[str, str]) -> Any:
     """Calls `function` as one marked HLO call."""
 
     def called(*arguments: Any) -> Any:
-        # The marks are for the call alone, not for all that it holds.
-        with set_xla_metadata(**_NO_MARK):
+        # The marks are for the call alone; all that it holds would inherit them.
+        with set_xla_metadata(**_UNMARKED):
             return function(*arguments), arguments
 
     with set_xla_metadata(**marks):

@@ -53,6 +53,14 @@ def test_it_is_one_kernel():
     assert " while(" not in entry
 
 
+def test_a_step_of_the_environment_is_one_kernel_and_the_new_truths_another(static):
+    env, params = make(static=static)
+    keys, action = jax.random.split(jax.random.key(0), 3), jnp.zeros(2, dtype=int)
+    states = jax.eval_shape(jax.vmap(env.reset_env, in_axes=(0, None)), keys, params)[1]
+    lowered = jax.jit(jax.vmap(env.step, in_axes=(0, 0, None, None))).lower(keys, states, action, params)
+    assert lowered.as_text().count('xla_cpu_small_call = "true"') == 2
+
+
 def test_arguments_of_no_use_are_harmless():
     """XLA ended the process over an argument that only its own simplifications made useless."""
 

@@ -152,3 +152,20 @@ def test_offsets_do_not_cancel_in_single_precision():
     np.testing.assert_allclose(sine, [[2e-6, 2e-6]], rtol=1e-3)
     # |d|^2 / (2 r): the displacement is square to the line of sight.
     np.testing.assert_allclose(range_change, [2e-8], atol=2e-9)
+
+
+def test_arctan2_in_single_precision_is_good_to_two_units_in_the_last_place():
+    angle = np.linspace(-np.pi, np.pi, 20_001)
+    size = 10.0 ** np.random.default_rng(0).uniform(-10, 10, angle.shape)
+    y, x = (np.float32(size * part) for part in (np.sin(angle), np.cos(angle)))
+    found = jax.jit(models.arctan2)(jnp.asarray(y), jnp.asarray(x))
+    exact = np.arctan2(y.astype(float), x.astype(float))
+    assert np.max(np.abs(found - exact) / np.spacing(np.abs(np.float32(exact)))) <= 2
+
+
+@pytest.mark.parametrize("y", [-1.0, -0.0, 0.0, 1.0])
+@pytest.mark.parametrize("x", [-2.0, 0.0, 2.0])
+def test_arctan2_on_the_axes(x, y):
+    found = models.arctan2(jnp.asarray([y], jnp.float32), jnp.asarray([x], jnp.float32))
+    np.testing.assert_allclose(found, np.arctan2(np.float32([y]), np.float32([x])), rtol=2e-7)
+    assert np.signbit(found[0]) == np.signbit(np.arctan2(y, x))
