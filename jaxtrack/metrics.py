@@ -4,15 +4,14 @@ from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
-import optax
 from flax import struct
 
-from jaxtrack.kernel import add_up
+from jaxtrack.assignment import NOBODY, assign
+from jaxtrack.kernel import add_up, one_by_one
 from jaxtrack.observation import covariance_norms
 from jaxtrack.params import Params
-from jaxtrack.types import Tracks, Truths, position
+from jaxtrack.types import Scalar, Tracks, Truths, position
 
-_NO_SLOT = -1
 _NO_STEP = -1
 
 
@@ -96,7 +95,7 @@ def gospa_step(
         The history after this step, and the metric.
     """
     single, slot = _gospa(truths, tracks, params)
-    has_track = slot != _NO_SLOT
+    has_track = slot != NOBODY
     birth_step, birth_detection = tracks.birth_step[slot], tracks.birth_detection[slot]
     counts = truths.alive & jnp.any(tracks.active)
 
@@ -133,18 +132,31 @@ def gospa_over_time(truths: Truths, tracks: Tracks, params: Params) -> Gospa:
 
 
 def _gospa(truths: Truths, tracks: Tracks, params: Params) -> tuple[Gospa, jax.Array]:
-    """GOSPA of one step, and the slot `[N]` assigned to every truth, or `_NO_SLOT`."""
+    """GOSPA of one step, and the slot `[N]` assigned to every truth, or `NOBODY`."""
     c, p = params.gospa_cutoff, params.gospa_order
     distances = jnp.minimum(position_distances(truths, tracks), c)
-    rows, columns = optax.assignment.hungarian_algorithm(distances**p)
-    assigned = distances[rows, columns]
-    close = assigned < c
+    slot = one_by_one(_match)(*jax.lax.stop_gradient((distances, c, p)))
+    close = slot != NOBODY
+    assigned = jnp.take_along_axis(distances, jnp.maximum(slot, 0)[:, None], axis=1)[:, 0]
     localisation = jnp.sum(jnp.where(close, assigned**p, 0.0))
     missed = (jnp.sum(truths.alive) - jnp.sum(close)) * c**p / 2
     false = (jnp.sum(tracks.active) - jnp.sum(close)) * c**p / 2
     distance = (localisation + missed + false) ** (1 / p)
-    slot = jnp.full(truths.alive.shape, _NO_SLOT).at[rows].set(jnp.where(close, columns, _NO_SLOT))
     return Gospa(distance, localisation, missed, false, jnp.zeros_like(distance)), slot
+
+
+def _match(distances: jax.Array, cutoff: Scalar, order: Scalar) -> jax.Array:
+    """Slot `[N]` of every truth, or `NOBODY`, by the cheapest assignment of `distances` `[N, T]`."""
+    close = distances < cutoff
+    contested = jnp.any(jnp.sum(close, axis=0) > 1) | jnp.any(jnp.sum(close, axis=1) > 1)
+
+    def cheapest() -> jax.Array:
+        return assign(jnp.where(close, distances / cutoff, 1.0) ** order)
+
+    # Mostly no two compete: then there is one way to pair all that are close.
+    slot = jax.lax.cond(contested, cheapest, lambda: jnp.argmax(close, axis=1))
+    within = close & (jnp.arange(close.shape[1]) == slot[:, None])
+    return jnp.where(jnp.any(within, axis=1), slot, NOBODY)
 
 
 class BasicMetrics(struct.PyTreeNode):

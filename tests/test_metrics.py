@@ -10,6 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from jaxtrack import Params, Tracks, Truths, metrics
+from jaxtrack.assignment import assign
+from jaxtrack.kernel import one_by_one
 
 gospa = jax.jit(metrics.gospa)
 gospa_over_time = jax.jit(metrics.gospa_over_time)
@@ -92,6 +94,68 @@ def test_gospa_equals_the_best_of_all_assignments(scene, truths, tracks, alive, 
     np.testing.assert_allclose(result.distance, expected, rtol=1e-5, atol=1e-3)
     parts = result.localisation + result.missed + result.false
     np.testing.assert_allclose(parts, expected**2, rtol=1e-5, atol=1e-2)
+
+
+@pytest.fixture
+def crowds(tracks_at):
+    """64 scenes of 4 truths and 6 tracks, some absent; in about half of them pairs compete."""
+    rng = np.random.default_rng(0)
+    state = np.zeros((64, 4, 6))
+    state[..., 0::2] = rng.uniform(0, 300, (64, 4, 3))
+    mean = np.pad(state, ((0, 0), (0, 2), (0, 0))) + 40 * rng.normal(size=(64, 6, 6))
+    tracks = jax.vmap(lambda mean: tracks_at(mean, 6))(mean).replace(
+        active=jnp.asarray(rng.random((64, 6)) < 0.8)
+    )
+    return Truths(jnp.asarray(state), jnp.asarray(rng.random((64, 4)) < 0.8)), tracks
+
+
+@pytest.mark.usefixtures("x64")
+@pytest.mark.parametrize("order", [1.0, 2.0])
+def test_scenes_where_no_pairs_compete_need_no_algorithm(crowds, order):
+    distances = np.asarray(jax.vmap(metrics.position_distances)(*crowds))
+    close = distances < 100.0
+    compete = (close.sum(axis=1) > 1).any(axis=1) | (close.sum(axis=2) > 1).any(axis=1)
+    assert 10 < compete.sum() < 54
+    costs = np.minimum(distances, 100.0) ** order
+    by_algorithm = np.asarray(jax.jit(jax.vmap(assign))(costs))[..., None]
+    paid = np.take_along_axis(costs, by_algorithm, axis=2)[..., 0]
+    assigned = np.where(paid < 100.0**order, by_algorithm[..., 0], -1)
+    params = PARAMS.replace(gospa_order=order)
+    found, slot = jax.jit(jax.vmap(metrics._gospa, in_axes=(0, 0, None)))(*crowds, params)
+    np.testing.assert_array_equal(slot, assigned)
+    np.testing.assert_allclose(found.localisation, np.where(assigned >= 0, paid, 0).sum(axis=1), rtol=1e-12)
+
+
+def test_gospa_is_the_same_alone_in_batches_in_a_scan_and_inside_another_kernel(crowds):
+    over = lambda function: jax.vmap(function, in_axes=(0, 0, None))  # noqa: E731
+    alone = [gospa(*jax.tree.map(lambda leaf, i=i: leaf[i], crowds), PARAMS).distance for i in range(64)]
+    squares = jax.tree.map(lambda leaf: leaf.reshape(8, 8, *leaf.shape[1:]), crowds)
+    rows = lambda _, scenes: (None, over(metrics.gospa)(*scenes, PARAMS))  # noqa: E731
+    for found in (
+        jax.jit(over(metrics.gospa))(*crowds, PARAMS),
+        jax.jit(over(over(metrics.gospa)))(*squares, PARAMS),
+        jax.jit(lambda scenes: jax.lax.scan(rows, None, scenes)[1])(squares),
+        jax.jit(over(one_by_one(metrics.gospa)))(*crowds, PARAMS),
+    ):
+        np.testing.assert_allclose(found.distance.ravel(), alone, rtol=1e-6)
+
+
+def test_gospa_can_be_differentiated(crowds):
+    truths, tracks = crowds
+    distance = lambda mean, truths, tracks: metrics.gospa(truths, tracks.replace(mean=mean), PARAMS).distance  # noqa: E731
+    value, found = jax.jit(jax.vmap(jax.value_and_grad(distance)))(tracks.mean, truths, tracks)
+    step = 1e-3 * found  # too short to change the assignment
+    rise = jax.jit(jax.vmap(distance))(tracks.mean + step, truths, tracks) - value
+    np.testing.assert_allclose(rise, jnp.sum(found * step, axis=(1, 2)), atol=2e-4)
+
+
+def test_the_assignments_of_a_batch_are_one_kernel(crowds):
+    """Otherwise everything still works, many times slower."""
+    together = jax.jit(jax.vmap(metrics.gospa, in_axes=(0, 0, None)))
+    text = together.lower(*crowds, PARAMS).compile().as_text()
+    entry = text[text.index("ENTRY") :]
+    assert 'xla_cpu_small_call="true"' in entry
+    assert " while(" not in entry
 
 
 def test_completeness_is_the_share_of_living_truths_with_a_track_in_reach(scene):
