@@ -15,7 +15,8 @@ from rich.progress import Progress
 from benchmarks.playing import first, raster
 from jaxtrack import policies
 from jaxtrack.cli import parse, require_file, require_integer, run, wide_console
-from jaxtrack.env import EnvState, make
+from jaxtrack.env import make
+from jaxtrack.episode import EnvState
 from jaxtrack.managers import expected_falls, greedy, rollout, uncertainty
 from jaxtrack.params import Params, StaticParams
 from jaxtrack.report import circumstances, print_table, spread

@@ -7,7 +7,8 @@ import jax
 import jax.numpy as jnp
 
 from jaxtrack import cores, policies
-from jaxtrack.env import EnvState, SearchTrack
+from jaxtrack.env import SearchTrack
+from jaxtrack.episode import EnvState
 from jaxtrack.observation import Observation
 from jaxtrack.params import Params, StaticParams
 

@@ -9,7 +9,7 @@ from jaxtrack.types import NO_DETECTION, Detections, Tracks, Truths
 __version__ = "0.1.0"
 
 # Imported on first use: gymnax brings Gymnasium along, which the tracker alone does not need.
-_LAZY = {"SearchTrack": "env", "EnvState": "env", "make": "env", "ENV_ID": "env"}
+_LAZY = {"SearchTrack": "env", "EnvState": "episode", "make": "env", "ENV_ID": "env"}
 
 __all__ = [
     "ENV_ID",

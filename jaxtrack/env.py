@@ -7,26 +7,19 @@ from typing import Any
 import gymnax
 import jax
 import jax.numpy as jnp
-from flax import struct
 from gymnax.environments import environment
 
 from jaxtrack import metrics, spaces, tracker
 from jaxtrack.association import MEASURES
+from jaxtrack.episode import EnvState, StepNoise, StepRecord, sample_step_noise
 from jaxtrack.kernel import Function, one_by_one
 from jaxtrack.observation import TRACK_FEATURES, Observation, observe
 from jaxtrack.params import Params, StaticParams, check_trajectories, validate
 from jaxtrack.reward import reward_terms
-from jaxtrack.sampling import draw
 from jaxtrack.scan_map import initial_scan_map, mean_scan_value, update_scan_map
-from jaxtrack.sensor import SensorNoise, cut_noise, detect, look_angles, num_draws
-from jaxtrack.truth import (
-    TruthNoise,
-    cut_truth_noise,
-    initiate_truths,
-    num_truth_draws,
-    propagate_truths,
-)
-from jaxtrack.types import Detections, Tracks, Truths
+from jaxtrack.sensor import detect, look_angles
+from jaxtrack.truth import initiate_truths, propagate_truths
+from jaxtrack.types import Tracks, Truths
 
 ENV_ID = "SearchTrack-v0"
 
@@ -35,59 +28,6 @@ ALWAYS_IN_INFO = ("completeness", "covariance_norm_sum", "covariance_norm_mean")
 
 LARGEST_IN_ONE_KERNEL = {"max_tracks": 200, "num_truths": 100, "max_detections": 50, "max_clutter": 50}
 """Larger scenarios are stepped all at once: XLA spreads their arrays over threads, one kernel can not."""
-
-
-@struct.dataclass
-class EnvState(environment.EnvState):
-    """State of one scenario.
-
-    Attributes:
-        time: `[]` steps since the start.
-        truths: the true targets; no policy may read them.
-        tracks: the track list.
-        scan_map: `[M, M]` scan value of every pixel.
-        num_born: `[]` truths born since the start, those that found no row included.
-        num_initiated: `[]` tracks initiated since the start.
-    """
-
-    time: jax.Array
-    truths: Truths
-    tracks: Tracks
-    scan_map: jax.Array  # [M, M]
-    num_born: jax.Array
-    num_initiated: jax.Array
-
-
-class StepNoise(struct.PyTreeNode):
-    """All that is random in one step.
-
-    Attributes:
-        truths: the draws of motion, deaths and births.
-        sensor: the draws of the look.
-    """
-
-    truths: TruthNoise
-    sensor: SensorNoise
-
-
-class StepRecord(struct.PyTreeNode):
-    """What happened in one step, for rendering and parity tests.
-
-    Attributes:
-        look: `[2]` boresight azimuth and elevation (rad).
-        detections: what the look returned.
-        num_dropped_truths: `[]` births for which no row was left.
-        num_dropped_detections: `[]` detections for which no slot was free.
-        num_dropped_tracks: `[]` new tracks for which no slot was free.
-        tracker: every intermediate of the tracker, or None where `play` left it out.
-    """
-
-    look: jax.Array
-    detections: Detections
-    num_dropped_truths: jax.Array
-    num_dropped_detections: jax.Array
-    num_dropped_tracks: jax.Array
-    tracker: tracker.TrackerInfo | None
 
 
 class SearchTrack(environment.Environment[EnvState, Params]):
@@ -212,12 +152,7 @@ class SearchTrack(environment.Environment[EnvState, Params]):
 
     def sample_noise(self, key: jax.Array) -> StepNoise:
         """Draws all that is random in one step; the key is consumed."""
-        for_truths, for_sensor = num_truth_draws(self.static.num_truths), num_draws(self.static)
-        # In one draw for both: short draws cost more than the numbers themselves.
-        normal, uniform = draw(key, *map(sum, zip(for_truths, for_sensor, strict=True)))
-        truths = cut_truth_noise(normal[: for_truths[0]], uniform[: for_truths[1]])
-        sensor = cut_noise(normal[for_truths[0] :], uniform[for_truths[1] :], self.static)
-        return StepNoise(truths=truths, sensor=sensor)
+        return sample_step_noise(key, self.static)
 
     def observe(
         self, key: jax.Array, state: EnvState, action: jax.Array | None, params: Params

@@ -29,7 +29,7 @@ from jaxtrack.sensor import in_beam, look_angles
 from jaxtrack.types import Detections, Tracks, Truths, position, where_rows
 
 if TYPE_CHECKING:
-    from jaxtrack.env import EnvState
+    from jaxtrack.episode import EnvState
 
 REWARDS = ("information", "paper", "as_printed")
 """Rewards that a manager can expect: sums over tracks that need no truth."""

@@ -23,7 +23,7 @@ from jaxtrack.sensor import in_beam, look_indices
 from jaxtrack.types import Tracks, position
 
 if TYPE_CHECKING:
-    from jaxtrack.env import EnvState
+    from jaxtrack.episode import EnvState
 
 Policy = Callable[[jax.Array, "EnvState"], jax.Array]
 PolicyBuilder = Callable[[StaticParams, Params], Policy]

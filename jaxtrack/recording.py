@@ -11,7 +11,8 @@ from jaxtrack.params import Params, StaticParams
 from jaxtrack.policies import Policy
 
 if TYPE_CHECKING:  # at run time it would bring gymnax, and that matplotlib, along
-    from jaxtrack.env import EnvState, SearchTrack, StepRecord
+    from jaxtrack.env import SearchTrack
+    from jaxtrack.episode import EnvState, StepRecord
 
 
 @dataclasses.dataclass(frozen=True)

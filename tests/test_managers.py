@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from jaxtrack import NO_DETECTION, Detections, Params, StaticParams, Tracks, Truths, kalman, tracker
-from jaxtrack.env import EnvState, SearchTrack
+from jaxtrack.env import SearchTrack
+from jaxtrack.episode import EnvState
 from jaxtrack.managers import (
     MANAGERS,
     REWARDS,

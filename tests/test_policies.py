@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from jaxtrack import Params, StaticParams, Tracks, Truths
-from jaxtrack.env import EnvState, SearchTrack
+from jaxtrack.env import SearchTrack
+from jaxtrack.episode import EnvState
 from jaxtrack.policies import POLICIES, REVISIT_SHARE, index, scheduler
 from jaxtrack.sensor import look_angles
 

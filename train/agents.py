@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import jax
 from flax import linen as nn
 
-from jaxtrack.env import EnvState
+from jaxtrack.episode import EnvState
 from jaxtrack.observation import Observation, observe
 from jaxtrack.params import Params, StaticParams
 from jaxtrack.policies import Policy, PolicyBuilder

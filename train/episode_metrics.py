@@ -8,7 +8,8 @@ from flax import struct
 from scipy.stats import chi2
 
 from jaxtrack import metrics
-from jaxtrack.env import EnvState, SearchTrack, StepRecord
+from jaxtrack.env import SearchTrack
+from jaxtrack.episode import EnvState, StepRecord
 from jaxtrack.matrices import inverse_3x3
 from jaxtrack.params import Params, StaticParams
 from jaxtrack.reward import reward_terms

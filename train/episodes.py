@@ -13,7 +13,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxtrack.env import EnvState, SearchTrack
+from jaxtrack.env import SearchTrack
+from jaxtrack.episode import EnvState
 from jaxtrack.params import Params
 from jaxtrack.policies import Policy, PolicyBuilder
 from train.episode_metrics import CURVES, METRICS, StepRow, episode_curves, episode_values, step_row

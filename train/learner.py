@@ -10,7 +10,8 @@ import jax.numpy as jnp
 import optax
 from flax import struct
 
-from jaxtrack.env import EnvState, SearchTrack
+from jaxtrack.env import SearchTrack
+from jaxtrack.episode import EnvState
 from jaxtrack.params import Params
 from train.agents import Agent, build_agent
 from train.config import TrainConfig

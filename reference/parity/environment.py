@@ -10,7 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxtrack import models
-from jaxtrack.env import EnvState, SearchTrack, StepNoise
+from jaxtrack.env import SearchTrack
+from jaxtrack.episode import EnvState, StepNoise
 from jaxtrack.params import REWARDS, Params, StaticParams
 from jaxtrack.reward import reward_terms
 from jaxtrack.sensor import look_indices

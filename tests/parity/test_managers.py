@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from jaxtrack import Params, StaticParams
-from jaxtrack.env import EnvState
+from jaxtrack.episode import EnvState
 from jaxtrack.managers import expected_falls, uncertainty
 from jaxtrack.scan_map import initial_scan_map, look_grid
 from jaxtrack.types import Truths
