@@ -61,6 +61,13 @@ def test_a_step_of_the_environment_is_one_kernel_and_the_new_truths_another(stat
     assert lowered.as_text().count('xla_cpu_small_call = "true"') == 2
 
 
+def test_other_devices_get_no_marks(monkeypatch):
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    both = kernel.one_by_one(kernel.stage(branching))
+    lowered = jax.jit(jax.vmap(both, in_axes=(0, None))).lower(rows(7, 5), SCALE)
+    assert "frontend_attributes" not in lowered.as_text()
+
+
 def test_arguments_of_no_use_are_harmless():
     """XLA ended the process over an argument that only its own simplifications made useless."""
 
