@@ -80,11 +80,11 @@ def compile_play(
     num_envs = start[1].time.shape[0]
     on_all = function if num_envs % jax.device_count() else cores.share_out(function, shared=1)
     keys = jax.random.split(jax.random.key(0), num_envs)
-    jitted, began = jax.jit(on_all), time.perf_counter()
-    jitted.lower(keys, start, params).compile()
+    began = time.perf_counter()
+    compiled = jax.jit(on_all).lower(keys, start, params).compile()
     seconds = time.perf_counter() - began
-    jax.block_until_ready(jitted(keys, start, params))
-    return jitted, seconds
+    jax.block_until_ready(compiled(keys, start, params))
+    return compiled, seconds
 
 
 def first(count: int, tree: Tree) -> Tree:

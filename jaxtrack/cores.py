@@ -1,10 +1,12 @@
 """All cores of a machine without an accelerator: each a device of its own, with its share of the scenarios.
 
-from jaxtrack import cores
+    from jaxtrack import cores
 
-cores.use()  # before the environment is imported: gymnax starts JAX
-env, params = jaxtrack.make()
-step = jax.jit(cores.share_out(jax.vmap(env.step, in_axes=(0, 0, 0, None)), shared=1))
+    cores.use()  # before the environment is imported: gymnax starts JAX
+    env, params = jaxtrack.make()
+    step = jax.jit(cores.share_out(jax.vmap(env.step, in_axes=(0, 0, 0, None)), shared=1))
+
+What is shared out gives what one core gives, but for rounding.
 """
 
 import contextlib
@@ -18,6 +20,11 @@ from jax.sharding import AxisType, PartitionSpec
 _AXIS = "cores"
 
 
+def available() -> int:
+    """Cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
 def use(number: int | None = None) -> int:
     """Makes `number` cores a device each, and returns how many devices there are.
 
@@ -25,7 +32,7 @@ def use(number: int | None = None) -> int:
     started, and on other devices than CPUs.
     """
     if number is None and "JAX_NUM_CPU_DEVICES" not in os.environ:
-        number = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+        number = available()
     if number is not None:
         with contextlib.suppress(RuntimeError):  # raised once JAX has started
             jax.config.update("jax_num_cpu_devices", number)

@@ -72,7 +72,7 @@ class SearchTrack(environment.Environment[EnvState, Params]):
         truncated = self.is_truncated(moved, params)
         done = terminated | truncated
         truths = self._one_by_one(self._initiate_truths_if)(done, key_reset, moved.truths, params)
-        first = self._begin(truths, params)
+        first = self._begin(key_reset, truths, params)
         observation, state = jax.tree.map(lambda new, old: jnp.where(done, new, old), first, (last, moved))
         ended = {"terminated": terminated, "truncated": truncated, "final_observation": last}
         return observation, state, reward, terminated, truncated, {**info, **ended}
@@ -83,9 +83,9 @@ class SearchTrack(environment.Environment[EnvState, Params]):
     def reset_env(self, key: jax.Array, params: Params) -> tuple[Observation, EnvState]:
         """New truths, no tracks, a field never seen."""
         check_trajectories(self.static, params)
-        return self._begin(initiate_truths(key, self.static, params), params)
+        return self._begin(key, initiate_truths(key, self.static, params), params)
 
-    def _begin(self, truths: Truths, params: Params) -> tuple[Observation, EnvState]:
+    def _begin(self, key: jax.Array, truths: Truths, params: Params) -> tuple[Observation, EnvState]:
         state = EnvState(
             time=jnp.asarray(0, dtype=int),
             truths=truths,
@@ -94,7 +94,7 @@ class SearchTrack(environment.Environment[EnvState, Params]):
             num_born=jnp.sum(truths.alive),
             num_initiated=jnp.asarray(0, dtype=int),
         )
-        return observe(state.tracks, state.scan_map, params), state
+        return self.observe(key, state, None, params), state
 
     def step_env(
         self, key: jax.Array, state: EnvState, action: jax.Array, params: Params

@@ -49,7 +49,8 @@ def one_by_one(function: Function) -> Function:
 
             return jax.lax.map(one, [leaf for leaf, each in zip(leaves, varies, strict=True) if each])
 
-        result = _call(loop, leaves, _ONE_KERNEL)
+        # All arguments come back: XLA ends the process over one that it found to be of no use.
+        result, _ = jax.lax.optimization_barrier(_as_call(loop, _ONE_KERNEL)(*leaves))
         return result, jax.tree.map(lambda _: True, result)
 
     return looped
@@ -61,11 +62,11 @@ def stage(function: Function) -> Function:
     XLA for CPUs would rather repeat arithmetic for every result that needs it; it does not look
     into a function that is called instead of inlined. Other devices get `function` as it is.
     """
+    called = _as_call(function, _NOT_INLINED)
 
     @functools.wraps(function)
     def staged(*arguments: Any) -> Any:
-        on_cpu = jax.default_backend() == "cpu"
-        return _call(function, arguments, _NOT_INLINED) if on_cpu else function(*arguments)
+        return called(*arguments)[0] if jax.default_backend() == "cpu" else function(*arguments)
 
     return staged
 
@@ -75,15 +76,21 @@ def add_up(terms: jax.Array, axis: int = 0) -> jax.Array:
     return functools.reduce(operator.add, jnp.unstack(terms, axis=axis))
 
 
-def _call(function: Function, arguments: Any, marks: dict[str, str]) -> Any:
-    """Calls `function` as one marked HLO call."""
+def _as_call(function: Function, marks: dict[str, str]) -> Function:
+    """`function` as one marked HLO call, which returns its arguments beside the result.
 
-    def called(*arguments: Any) -> Any:
+    Traced once for all calls with the same shapes.
+    """
+
+    def unmarked(*arguments: Any) -> Any:
         # The marks are for the call alone; all that it holds would inherit them.
         with set_xla_metadata(**_UNMARKED):
             return function(*arguments), arguments
 
-    with set_xla_metadata(**marks):
-        result, echo = jax.jit(called)(*arguments)
-    # All arguments are returned: XLA ends the process over one that it found to be of no use.
-    return jax.lax.optimization_barrier((result, echo))[0] if marks == _ONE_KERNEL else result
+    jitted = jax.jit(unmarked)
+
+    def call(*arguments: Any) -> Any:
+        with set_xla_metadata(**marks):
+            return jitted(*arguments)
+
+    return call

@@ -19,7 +19,7 @@ import jax.numpy as jnp
 from jaxtrack.models import elevation_bearing_range
 from jaxtrack.params import Params, StaticParams
 from jaxtrack.scan_map import beam_means, look_grid
-from jaxtrack.sensor import in_beam, look_indices
+from jaxtrack.sensor import in_beam, look_number
 from jaxtrack.types import Tracks, position
 
 if TYPE_CHECKING:
@@ -155,8 +155,7 @@ def to_action(index: jax.Array, static: StaticParams, params: Params) -> jax.Arr
 def nearest_look(mean: jax.Array, static: StaticParams, params: Params) -> jax.Array:
     """Index of the discrete look nearest in angle to a track's mean `[6]`."""
     elevation, azimuth, _ = elevation_bearing_range(mean)
-    azimuth_index, elevation_index = look_indices(jnp.stack([azimuth, elevation]), static, params)
-    return azimuth_index * static.num_looks + elevation_index
+    return look_number(jnp.stack([azimuth, elevation]), static, params)
 
 
 def trace_share(tracks: Tracks, params: Params) -> jax.Array:

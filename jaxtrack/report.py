@@ -1,6 +1,5 @@
 """What every command reports beside its figures, and how tables are printed."""
 
-import os
 import platform
 from collections.abc import Sequence
 from datetime import UTC, datetime
@@ -12,6 +11,8 @@ import jax
 import numpy as np
 from rich.console import Console
 from rich.table import Table
+
+from jaxtrack import cores
 
 PACKAGES = ("jaxtrack", "jax", "jaxlib", "gymnax", "numpy", "stonesoup")
 
@@ -33,7 +34,7 @@ def circumstances() -> dict[str, Any]:
         "versions": {"python": platform.python_version(), **versions()},
         "machine": {
             "processor": processor(),
-            "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
+            "cores": cores.available(),
             "system": platform.system(),
             "jax_backend": jax.default_backend(),
         },

@@ -10,7 +10,7 @@ from flax import struct
 
 from jaxtrack.models import direction, measurement_sigmas, spherical, wrap_detection
 from jaxtrack.params import Params, StaticParams
-from jaxtrack.sampling import draw, matches, poisson_quantile
+from jaxtrack.sampling import matches, poisson_quantile
 from jaxtrack.types import NO_TRUTH, Detections, Truths, position
 
 
@@ -46,11 +46,6 @@ def cut_noise(normal: jax.Array, uniform: jax.Array, static: StaticParams) -> Se
     )
 
 
-def sample_noise(key: jax.Array, static: StaticParams) -> SensorNoise:
-    """Draws all that is random in one look; the key is consumed."""
-    return cut_noise(*draw(key, *num_draws(static)), static)
-
-
 def look_angles(action: jax.Array, static: StaticParams, params: Params) -> jax.Array:
     """Boresight `[..., 2]` (azimuth, elevation in rad) of an action (paper, eq. 2).
 
@@ -69,6 +64,12 @@ def look_indices(angles: jax.Array, static: StaticParams, params: Params) -> jax
     """Indices `[..., 2]` of the discrete look nearest to angles `[..., 2]` (azimuth, elevation in rad)."""
     last = static.num_looks - 1
     return jnp.clip(jnp.round((angles / params.field_limit + 1) / 2 * last), 0, last).astype(int)
+
+
+def look_number(angles: jax.Array, static: StaticParams, params: Params) -> jax.Array:
+    """Number ``i L + j`` of the discrete look (i, j) nearest to angles `[2]` (azimuth, elevation in rad)."""
+    azimuth, elevation = look_indices(angles, static, params)
+    return azimuth * static.num_looks + elevation
 
 
 def boresight_frame(points: jax.Array, look: jax.Array) -> jax.Array:

@@ -9,7 +9,7 @@ from flax import struct
 
 from jaxtrack.models import direction, interleave
 from jaxtrack.params import Params, StaticParams
-from jaxtrack.sampling import draw, poisson_quantile
+from jaxtrack.sampling import poisson_quantile
 from jaxtrack.types import Scalar, Truths, position, velocity
 
 MOST_BIRTHS = 4
@@ -41,11 +41,6 @@ def cut_truth_noise(normal: jax.Array, uniform: jax.Array) -> TruthNoise:
     return TruthNoise(motion=normal.reshape(-1, 3, 2), death=uniform[:-1], birth_count=uniform[-1])
 
 
-def sample_truth_noise(key: jax.Array, num_truths: int) -> TruthNoise:
-    """Draws all that is random in one step of the truths; the key is consumed."""
-    return cut_truth_noise(*draw(key, *num_truth_draws(num_truths)))
-
-
 def initiate_truths(key: jax.Array, static: StaticParams, params: Params) -> Truths:
     """Truths `[N]` at the start: uniform in azimuth, elevation and range, normal in velocity.
 
@@ -75,7 +70,7 @@ def born_state(angles: jax.Array, share: jax.Array, velocity: jax.Array, params:
     distance = params.min_range + share * (params.max_range - params.min_range)
     positions = distance * direction(azimuth, elevation)
     velocities = params.truth_velocity_sigma * velocity
-    return jnp.stack([positions, velocities], axis=-1).reshape(-1, 6)
+    return interleave(positions, velocities)
 
 
 def propagate_truths(

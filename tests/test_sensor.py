@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from jaxtrack import NO_DETECTION, Params, StaticParams, sensor
+from jaxtrack.episode import sample_step_noise
 from jaxtrack.sensor import SensorNoise
 from jaxtrack.types import NO_TRUTH
 
@@ -193,8 +194,8 @@ def test_an_empty_beam_returns_nothing(truths_at, static, params):
 
 def test_draws_have_their_laws_and_depend_on_the_key():
     static = StaticParams(num_truths=2000, max_clutter=700)
-    noise = jax.jit(sensor.sample_noise, static_argnums=1)(jax.random.key(0), static)
-    other = jax.jit(sensor.sample_noise, static_argnums=1)(jax.random.key(1), static)
+    sample = jax.jit(sample_step_noise, static_argnums=1)
+    noise, other = (sample(jax.random.key(seed), static).sensor for seed in (0, 1))
     np.testing.assert_allclose(np.cov(np.asarray(noise.detection).T), np.eye(3), atol=0.16)
     for uniform in (noise.detected, noise.clutter):
         assert np.all((uniform >= 0) & (uniform < 1))

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from jaxtrack import Params, StaticParams, Truths
+from jaxtrack.episode import sample_step_noise
 from jaxtrack.models import constant_velocity, spherical
 from jaxtrack.truth import (
     TruthNoise,
@@ -14,7 +15,6 @@ from jaxtrack.truth import (
     move_truths,
     process_noise_factor,
     propagate_truths,
-    sample_truth_noise,
 )
 from jaxtrack.types import position, velocity
 
@@ -165,7 +165,7 @@ def test_more_births_than_rows_are_all_counted():
 
 
 def test_no_draw_serves_twice():
-    noise = sample_truth_noise(jax.random.key(0), 50)
+    noise = sample_step_noise(jax.random.key(0), StaticParams(num_truths=50)).truths
     uniform = np.append(noise.death, noise.birth_count)
     assert len(np.unique(uniform)) == 51
     assert len(np.unique(noise.motion)) == 300
@@ -177,7 +177,7 @@ def test_births_and_deaths_are_as_frequent_as_asked():
     keys = jax.random.split(jax.random.key(1), 200)
 
     def step(carry, key):
-        noise = sample_truth_noise(key, MANY.num_truths)
+        noise = sample_step_noise(key, MANY).truths
         truths, num_born, _ = propagate_truths(*carry, noise, 1, params)
         return (truths, num_born), (jnp.sum(carry[0].alive), jnp.sum(truths.alive), num_born)
 

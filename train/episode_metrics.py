@@ -11,9 +11,10 @@ from jaxtrack import metrics
 from jaxtrack.env import SearchTrack
 from jaxtrack.episode import EnvState, StepRecord
 from jaxtrack.matrices import inverse_3x3
-from jaxtrack.params import Params, StaticParams
+from jaxtrack.params import Params
 from jaxtrack.reward import reward_terms
-from jaxtrack.sensor import look_indices
+from jaxtrack.scan_map import mean_scan_value
+from jaxtrack.sensor import look_number
 from jaxtrack.siap import siap
 from jaxtrack.types import STATE_DIM, Tracks, Truths, position, velocity
 
@@ -96,7 +97,7 @@ def step_row(
         "covariance_norm_mean": metrics.covariance_norm_mean(tracks),
         "covariance_norm_sum": metrics.covariance_norm_sum(tracks),
         "uncertainty_per_truth": metrics.uncertainty_per_truth(truths, tracks, params),
-        "mean_scan_value": jnp.mean(after.scan_map),
+        "mean_scan_value": mean_scan_value(after.scan_map),
         "reward": reward[0] + reward[1],
     }
     return StepRow(
@@ -165,12 +166,6 @@ def nees(error: jax.Array, covariance: jax.Array) -> jax.Array:
     surprise = velocity(error) - gain @ position(error)
     left = covariance[1::2, 1::2] - gain @ cross
     return position(error) @ inverse @ position(error) + surprise @ inverse_3x3(left) @ surprise
-
-
-def look_number(look: jax.Array, static: StaticParams, params: Params) -> jax.Array:
-    """Number of the discrete look nearest in angle to a boresight `[2]` (rad)."""
-    azimuth, elevation = look_indices(look, static, params)
-    return azimuth * static.num_looks + elevation
 
 
 def _gospa(truths: Truths, tracks: Tracks, params: Params) -> dict[str, jax.Array]:

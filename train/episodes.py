@@ -3,7 +3,6 @@
 import dataclasses
 import itertools
 import math
-import os
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -13,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxtrack import cores
 from jaxtrack.env import SearchTrack
 from jaxtrack.episode import EnvState
 from jaxtrack.params import Params
@@ -160,8 +160,7 @@ def workers() -> int:
     """Chunks that are played at the same time: XLA takes little more than one core for one."""
     if jax.default_backend() != "cpu":
         return 1
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return min(cores, MOST_WORKERS)
+    return min(cores.available(), MOST_WORKERS)
 
 
 def compile_program(

@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-import os
 import sys
 import time
 from collections.abc import Iterable, Iterator, Sequence
@@ -13,6 +12,7 @@ import jax
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from jaxtrack import cores
 from jaxtrack.cli import parse, require_file, require_integer, run, wide_console
 from jaxtrack.report import circumstances
 from reference.parity.environment import environment_rows
@@ -83,7 +83,7 @@ def check(options: ParityOptions) -> None:
 
 def measure(options: ParityOptions, progress: Progress) -> tuple[list[Row], list[str]]:
     """All rows of the table, and every first divergence in one line."""
-    processes = options.processes or len(os.sched_getaffinity(0))
+    processes = options.processes or cores.available()
 
     def follow(items: Iterable[Item], total: int, what: str) -> Iterator[Item]:
         if progress.disable:  # in a log, a line where a bar would begin

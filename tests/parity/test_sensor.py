@@ -9,6 +9,7 @@ from stonesoup.sensor.radar.radar import RadarRotatingElevationBearingRange
 from stonesoup.types.groundtruth import GroundTruthState
 
 from jaxtrack import Params, StaticParams, Truths, models, sensor
+from jaxtrack.episode import sample_step_noise
 from reference.components import measurement_model
 from reference.parity.scenes import unit_vectors
 from reference.radar import build_radar, steer
@@ -88,7 +89,7 @@ def test_boresight_frame(look):
 
 
 def quiet_look(static):
-    noise = sensor.sample_noise(jax.random.key(0), static)
+    noise = sample_step_noise(jax.random.key(0), static).sensor
     return noise.replace(detection=0 * noise.detection, detected=0 * noise.detected)
 
 

@@ -9,8 +9,9 @@ from scipy.optimize import linear_sum_assignment
 from jaxtrack import Params, StaticParams
 from jaxtrack.env import SearchTrack
 from jaxtrack.policies import POLICIES
+from jaxtrack.sensor import look_number
 from train import episode_metrics, episodes
-from train.episode_metrics import CURVES, METRICS, NEES_BAND, look_number, mean_wait, nees
+from train.episode_metrics import CURVES, METRICS, NEES_BAND, mean_wait, nees
 from train.episodes import Competitor, compare, rule
 from train.results import summarise
 
