@@ -21,6 +21,7 @@ from rich.text import Text
 
 from jaxtrack.cli import parse, require_integer, run, wide_console
 from jaxtrack.env import SearchTrack
+from jaxtrack.managers import MANAGERS
 from jaxtrack.params import Params, StaticParams
 from jaxtrack.policies import POLICIES
 from train.agents import agent_policy
@@ -33,7 +34,7 @@ from train.scenarios import build_scenario
 COMPARED_SEED = 1_000_000
 """Seed of the scenarios on which policies are compared, far from the seeds of training."""
 
-ALL = "all"
+ALL, PLANNERS = "all", "planners"
 IMPORTANT_SHAPES = ("max_tracks", "map_size", "num_looks", "continuous_actions")
 """Shapes that fix an agent's inputs and outputs."""
 UNIMPORTANT = ("seed", "out", "evaluation_episodes", "checkpoint_every")
@@ -42,10 +43,11 @@ UNIMPORTANT = ("seed", "out", "evaluation_episodes", "checkpoint_every")
 
 @dataclasses.dataclass(frozen=True)
 class EvaluateOptions:
-    """Compares policies on the same scenarios: baselines, and trained runs."""
+    """Compares policies on the same scenarios: baselines, planners, and trained runs."""
 
     policies: tuple[str, ...] = (ALL,)
-    """Names of baselines, or "all"; no name after the option for none."""
+    """Names of baselines: random, static, coverage, stalest, scheduler, index, index_tuned, or "all";
+    and of planners: greedy, rollout, uncertainty, or "planners". No name after the option for none."""
     runs: Annotated[tuple[Path, ...], tyro.conf.arg(aliases=["--run"])] = ()
     """Folders of trained runs; runs that differ in nothing but their seed are one policy."""
     episodes: int = 100
@@ -92,8 +94,9 @@ def check(options: EvaluateOptions) -> None:
     for name, low in (("episodes", 1), ("seed", 0)):
         require_integer(name, getattr(options, name), low)
     for name in options.policies:
-        if name != ALL and name not in POLICIES:
-            raise ValueError(f"policies = {name!r}: expected {ALL}, or some of {', '.join(POLICIES)}")
+        if name not in (ALL, PLANNERS, *POLICIES, *MANAGERS):
+            known = ", ".join([*POLICIES, *MANAGERS])
+            raise ValueError(f"policies = {name!r}: expected {ALL}, {PLANNERS}, or some of {known}")
     if options.page is not None and options.out is None:
         raise ValueError("page: expected a folder for its figures too, --out")
 
@@ -109,8 +112,13 @@ def check_shapes(folder: Path, config: TrainConfig, static: StaticParams) -> Non
 
 
 def baselines(names: Sequence[str]) -> dict[str, Competitor]:
-    """Policies that are not trained, by name, each once."""
-    return {name: rule(POLICIES[name]) for name in (POLICIES if ALL in names else names)}
+    """Policies that are not trained, each once, by the name that they get in tables.
+
+    A planner is called one there: `greedy` alone could be an agent that takes its most probable look.
+    """
+    builders, groups = {**POLICIES, **MANAGERS}, {ALL: POLICIES, PLANNERS: MANAGERS}
+    wanted = [name for word in names for name in groups.get(word, [word])]
+    return {f"{name} planner" if name in MANAGERS else name: rule(builders[name]) for name in wanted}
 
 
 def group_runs(runs: Sequence[tuple[Path, TrainConfig, Any]], greedy: bool) -> dict[str, Competitor]:

@@ -3,6 +3,7 @@
 import csv
 import dataclasses
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,8 @@ import pytest
 
 from jaxtrack import Params, StaticParams
 from jaxtrack.cli import run
+from jaxtrack.managers import MANAGERS
+from jaxtrack.policies import POLICIES
 from tests.train.compared import THREE
 from train import evaluate
 from train.config import TrainConfig
@@ -37,7 +40,7 @@ def evaluated(tmp_path_factory):
     """Folder after the whole command."""
     folder = tmp_path_factory.mktemp("evaluated")
     (folder / "tiny.toml").write_text(TINY)
-    options = ["--policies", "random", "static", "--episodes", "3", "--scenario", str(folder / "tiny.toml")]
+    options = ["--policies", "random", "greedy", "--episodes", "3", "--scenario", str(folder / "tiny.toml")]
     page = folder / "pages" / "results.md"
     assert evaluate.main([*options, "--out", str(folder / "out"), "--page", str(page)]) == 0
     return folder
@@ -49,18 +52,19 @@ def test_the_command_leaves_tables_curves_figures_and_a_page(evaluated):
         ["results.json", "episodes.csv", "curves.npz", *(f"{name}.png" for name in FIGURES)]
     )
     found = json.loads((out / "results.json").read_text())
-    assert list(found["policies"]) == ["random", "static"]
+    assert list(found["policies"]) == ["random", "greedy planner"]
     assert found["seed"] == COMPARED_SEED
     assert found["scenario"]["params"]["beam_azimuth"] == 0.9
     assert found["scenario"]["static"]["num_looks"] == 3
     rows = list(csv.DictReader((out / "episodes.csv").read_text().splitlines()))
-    assert [row["policy"] for row in rows] == ["random"] * 3 + ["static"] * 3
+    assert [row["policy"] for row in rows] == ["random"] * 3 + ["greedy planner"] * 3
     mean = found["policies"]["random"]["metrics"]["gospa"]["mean"]["value"]
     assert mean == pytest.approx(np.mean([float(row["gospa"]) for row in rows[:3]]), rel=1e-6)
     page = (evaluated / "pages" / "results.md").read_text()
     for name in FIGURES:
         assert f"]({Path('..') / 'out' / f'{name}.png'})" in page
-    assert "python -m train.evaluate --policies random static --episodes 3" in page
+    assert "python -m train.evaluate --policies random greedy --episodes 3" in page
+    assert "| greedy planner |" in page
 
 
 def test_without_out_nothing_is_written(monkeypatch, tmp_path, capsys):
@@ -78,7 +82,11 @@ def test_without_out_nothing_is_written(monkeypatch, tmp_path, capsys):
         (["--seed", "-1"], "seed = -1: expected an integer >= 0"),
         (["--run", "nowhere"], "run = 'nowhere': expected a folder with a config.json"),
         (["--runs", "nowhere", "else"], "run = 'nowhere': expected a folder with a config.json"),
-        (["--policies", "best"], "policies = 'best': expected all, or some of random, static, coverage"),
+        (
+            ["--policies", "index", "best"],
+            "policies = 'best': expected all, planners, or some of random, static, coverage, stalest, "
+            "scheduler, index, index_tuned, greedy, rollout, uncertainty",
+        ),
         (["--policies"], "policies: expected at least one name, or a run"),
         (["--scenario", "moon"], "scenario = 'moon': expected paper, clutter, slow, births, or a .toml"),
         (["--scenario", "moon.toml"], "config = 'moon.toml': "),
@@ -161,3 +169,25 @@ def test_baselines_come_once_and_in_the_order_asked_for(monkeypatch):
     monkeypatch.setattr(evaluate, "POLICIES", {"one": None, "two": None})
     assert list(baselines(["all"])) == ["one", "two"]
     assert baselines([]) == {}
+
+
+def test_planners_have_names_of_their_own():
+    found = baselines(["index", "planners", "greedy"])
+    assert list(found) == ["index", "greedy planner", "rollout planner", "uncertainty planner"]
+    assert {name: one.build(()) for name, one in found.items()} == {
+        "index": POLICIES["index"],
+        **{f"{name} planner": builder for name, builder in MANAGERS.items()},
+    }
+
+
+def test_a_training_is_compared_with_rules_only(monkeypatch):
+    monkeypatch.setattr(evaluate, "play", lambda competitors, *arguments: list(competitors))
+    assert evaluate.compare_with_baselines("own", *[None] * 6) == ["own", *POLICIES]
+
+
+def test_help_names_every_policy(capsys):
+    with pytest.raises(SystemExit):
+        evaluate.main(["--help"])
+    said = capsys.readouterr().out
+    words = set(re.findall(r"\w+", said[: said.index("--run")]))
+    assert words >= {"all", "planners", *POLICIES, *MANAGERS}
