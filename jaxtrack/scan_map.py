@@ -14,7 +14,7 @@ from jaxtrack.models import direction
 from jaxtrack.params import Params, StaticParams
 from jaxtrack.sensor import in_beam, look_angles
 
-BAND_SHARE = 6
+BAND_SHARE = 8
 """`beam_means` takes the short way if no beam crosses more than this part of the map's rows."""
 
 
@@ -91,22 +91,28 @@ def beam_means(static: StaticParams, params: Params) -> Callable[[jax.Array], ja
     """The function of a map `[M, M]` that gives the mean scan value in the beam of every look `[L * L]`.
 
     `beam_weights` times the map. A beam crosses few rows of the map, the same for all looks of
-    one elevation: where they are at most a sixth, only those are multiplied.
+    one elevation: where they are at most an eighth, only those are multiplied.
     """
-    weights = beam_weights(static, params)
     looks, pixels = static.num_looks, static.map_size
-    grid = weights.reshape(looks, looks, pixels, pixels)  # azimuth, elevation, row, column
-    crossed = jnp.any(grid > 0, axis=(0, 3))
-    band = -(-pixels // BAND_SHARE)
-    rows = jnp.minimum(jnp.argmax(crossed, axis=1), pixels - band)[:, None] + jnp.arange(band)
-    elevation = jnp.arange(looks)[:, None]
-    banded = grid[:, elevation, rows]
-    enough = jnp.sum(crossed[elevation, rows]) == jnp.sum(crossed)
+    height = -(-pixels // BAND_SHARE)
+    # Elevation, azimuth, row, column.
+    grid = jnp.swapaxes(beam_weights(static, params).reshape(looks, looks, pixels, pixels), 0, 1)
+    crossed = jnp.any(grid > 0, axis=(1, 3))
+    first = jnp.minimum(jnp.argmax(crossed, axis=1), pixels - height)
+
+    def band(matrix: jax.Array, first: jax.Array, axis: int) -> jax.Array:
+        return jax.lax.dynamic_slice_in_dim(matrix, first, height, axis)
+
+    enough = jnp.sum(jax.vmap(band, in_axes=(0, 0, None))(crossed, first, 0)) == jnp.sum(crossed)
+    weights = jax.vmap(band, in_axes=(0, 0, None))(grid, first, 1).reshape(looks, looks, -1)
+    bands = list(zip(jnp.unstack(weights), jnp.unstack(first), strict=True))
 
     def of_crossed_rows(scan_map: jax.Array) -> jax.Array:
-        return jnp.einsum("aerc,erc->ae", banded, scan_map[rows]).ravel()
+        means = [weights @ band(scan_map, first, 0).ravel() for weights, first in bands]
+        return jnp.stack(means, axis=1).ravel()
 
     def of_all_rows(scan_map: jax.Array) -> jax.Array:
-        return weights @ scan_map.ravel()
+        # The matrix is made anew: a loop around a branch would copy it at every turn.
+        return beam_weights(static, params) @ scan_map.ravel()
 
     return lambda scan_map: jax.lax.cond(enough, of_crossed_rows, of_all_rows, scan_map)

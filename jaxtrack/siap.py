@@ -85,7 +85,7 @@ def siap(truths: Truths, tracks: Tracks, times: jax.Array, params: Params) -> Si
     durations = jnp.diff(times)[:, None, None] * (until > steps)[:-1]  # [K - 1, T, N]
     followed_time = jnp.sum(jnp.max(durations, axis=1))
     changes = jnp.sum(jnp.maximum(tracks_needed(until, last, truths.alive) - 1, 0))
-    longest = jnp.sum(_longest_times(durations, begun, last))
+    longest = jnp.sum(_longest_times(durations, begun))
     return Siap(
         **vars(totals),
         track_change_rate=_quotient(changes, followed_time),
@@ -160,11 +160,17 @@ def _ratios(
     )
 
 
-def _longest_times(durations: jax.Array, begun: jax.Array, last: jax.Array) -> jax.Array:
+def _longest_times(durations: jax.Array, begun: jax.Array) -> jax.Array:
     """`[N]` longest time (s) that one track spent with a truth, over all its stretches."""
-    spent = jnp.cumsum(jnp.pad(durations, ((1, 0), (0, 0), (0, 0))), axis=0)  # [K, T, N] since step 0
-    of_track = jnp.take_along_axis(spent, last[..., None], axis=0) - spent
-    return jnp.max(jnp.where(begun[..., None], of_track, 0.0), axis=(0, 1))
+
+    def one_step(carry: tuple[jax.Array, jax.Array], now: tuple[jax.Array, jax.Array]) -> tuple:
+        spent, longest = carry  # [T, N] by the present tracks, [N]
+        duration, begins = now
+        spent = jnp.where(begins[:, None], 0.0, spent) + duration
+        return (spent, jnp.maximum(longest, jnp.max(spent, axis=0))), None
+
+    nothing = jnp.zeros(durations.shape[1:])
+    return jax.lax.scan(one_step, (nothing, nothing[0]), (durations, begun[:-1]))[0][1]
 
 
 def _last_steps(begun: jax.Array) -> jax.Array:

@@ -145,7 +145,13 @@ def followed_until(stretches: Stretch, num_truths: int) -> jax.Array:
     start = jnp.where(stretches.truth == NO_TRUTH, num_steps, stretches.start)  # outside: dropped
     ends = jnp.full((num_steps, slots.size, num_truths), -1)
     ends = ends.at[start, slots, stretches.truth].max(stretches.end, mode="drop")
-    return jax.lax.cummax(ends, axis=0)
+
+    def one_step(latest: jax.Array, ends: jax.Array) -> tuple[jax.Array, jax.Array]:
+        latest = jnp.maximum(latest, ends)
+        return latest, latest
+
+    # Many times faster than `jax.lax.cummax`.
+    return jax.lax.scan(one_step, ends[0], ends)[1]
 
 
 def _close(following: Following, ends: jax.Array) -> Stretch:
