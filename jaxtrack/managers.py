@@ -1,10 +1,4 @@
-"""Sensor managers: policies that try looks in the expected world before they choose one.
-
-In the expected world a look detects every live track whose predicted mean lies in its beam,
-exactly where it is expected, and the detection belongs to that track. So covariances fall as
-the filter says, means stay predicted, nothing is random and no truth is read. No track is ever
-found there: what search may find pays only through the scan map. And no track is ever missed: one
-that has lost its truth, or shares it with another, is looked at again and again until it is deleted.
+"""Sensor managers: policies that try looks in the expected world (`expected_world`) before they choose one.
 
 Counterparts in Stone Soup: `BruteForceSensorManager` with a `RewardFunction`.
 
@@ -18,15 +12,10 @@ from typing import TYPE_CHECKING
 import jax
 import jax.numpy as jnp
 
-from jaxtrack import kalman
-from jaxtrack.lifecycle import delete_uncertain_tracks
-from jaxtrack.observation import covariance_norms
+from jaxtrack.expected_world import beam_pixels, expected_falls, expected_rewards, expected_step
 from jaxtrack.params import Params, StaticParams
-from jaxtrack.policies import Policy, PolicyBuilder, index, to_action, tracks_in_beams
-from jaxtrack.reward import TRACK_TERMS, reward_terms
-from jaxtrack.scan_map import beam_weights, look_grid, update_scan_map
-from jaxtrack.sensor import in_beam, look_angles
-from jaxtrack.types import Detections, Tracks, Truths, position, where_rows
+from jaxtrack.policies import Policy, PolicyBuilder, index, to_action
+from jaxtrack.scan_map import look_grid
 
 if TYPE_CHECKING:
     from jaxtrack.episode import EnvState
@@ -134,54 +123,6 @@ def uncertainty(static: StaticParams, params: Params) -> Policy:
 MANAGERS: dict[str, PolicyBuilder] = {"greedy": greedy, "rollout": rollout, "uncertainty": uncertainty}
 
 
-def expected_rewards(
-    state: "EnvState", looks: jax.Array, pixels: jax.Array, static: StaticParams, params: Params
-) -> jax.Array:
-    """Expected reward `[A]` of the next step for every look.
-
-    Tracks are predicted and updated once; a look is then a choice between two worths of every
-    track, and the share of the map that it clears.
-
-    Args:
-        state: the present state; its truths are not read.
-        looks: `[A, 2]` boresights (rad).
-        pixels: `[A, M * M]` 1 for the pixels in the beam of a look, else 0.
-        static: shapes, and the reward.
-        params: numbers.
-    """
-    predicted, updated = expected_outcomes(state.tracks, params)
-    missed = _worths(state.tracks, predicted, static, params)
-    gained = _worths(state.tracks, updated, static, params) - missed
-    track = jnp.sum(missed) + tracks_in_beams(predicted, looks, params) @ gained
-    aged = update_scan_map(state.scan_map, jnp.full(2, jnp.nan), static, params)  # NaN looks nowhere
-    scan_value = (jnp.sum(aged) - pixels @ aged.ravel()) / aged.size
-    return params.track_weight * track - params.search_weight * scan_value
-
-
-def expected_falls(tracks: Tracks, looks: jax.Array, params: Params) -> jax.Array:
-    """Fall `[A]` of the covariance norm by the update, summed over the tracks in the beam of every look.
-
-    Stone Soup's `UncertaintyRewardFunction`.
-    """
-    predicted, updated = expected_outcomes(tracks, params)
-    fall = covariance_norms(predicted) - covariance_norms(updated)
-    return tracks_in_beams(predicted, looks, params) @ jnp.where(tracks.active, fall, 0.0)
-
-
-def expected_step(
-    state: "EnvState", action: jax.Array, static: StaticParams, params: Params
-) -> tuple["EnvState", jax.Array]:
-    """One step of the expected world: the state after it, truths untouched, and the reward."""
-    look = look_angles(action, static, params)
-    predicted, updated = expected_outcomes(state.tracks, params)
-    detected = in_beam(position(predicted.mean), look, params)
-    tracks = jax.tree.map(lambda a, b: where_rows(detected, a, b), updated, predicted)
-    tracks = delete_uncertain_tracks(tracks, params)
-    scan_map = update_scan_map(state.scan_map, look, static, params)
-    track, search = reward_terms(state.tracks, tracks, _no_truths(), scan_map, static, params)
-    return state.replace(time=state.time + 1, tracks=tracks, scan_map=scan_map), track + search
-
-
 def expected_return(
     key: jax.Array,
     state: "EnvState",
@@ -201,31 +142,6 @@ def expected_return(
     state, first = expected_step(state, action, static, params)
     rest = jax.lax.scan(one_step, state, discount ** jnp.arange(1, horizon + 1))[1]
     return first + rest.sum()
-
-
-def expected_outcomes(tracks: Tracks, params: Params) -> tuple[Tracks, Tracks]:
-    """The track list one step on, if no track is detected and if all are; nothing is deleted."""
-    predicted = kalman.predict(tracks, params.time_step, params)
-    expected = kalman.predict_detections(predicted, params)
-    own = jnp.arange(tracks.active.shape[0])
-    return predicted, kalman.update(predicted, expected, Detections.from_values(expected.mean), own)
-
-
-def _worths(before: Tracks, after: Tracks, static: StaticParams, params: Params) -> jax.Array:
-    """Track term of the reward, track by track `[T]`: the term is a sum over them."""
-    term, after = TRACK_TERMS[static.reward], delete_uncertain_tracks(after, params)
-    # Track lists of one track each.
-    alone = jax.tree.map(lambda leaf: leaf[:, None], (before, after))
-    return jax.vmap(lambda before, after: term(before, after, _no_truths(), static, params))(*alone)
-
-
-def _no_truths() -> Truths:
-    return Truths(state=jnp.zeros((0, 6)), alive=jnp.zeros(0, dtype=bool))
-
-
-def beam_pixels(static: StaticParams, params: Params) -> jax.Array:
-    """`[L * L, M * M]` 1 where a pixel lies in the beam of a look."""
-    return (beam_weights(static, params) > 0).astype(float)
 
 
 def _planned(
