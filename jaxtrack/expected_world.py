@@ -81,13 +81,8 @@ def expected_step(
 ) -> tuple["EnvState", jax.Array]:
     """One step of the expected world: the state after it, truths untouched, and the reward."""
     look = look_angles(action, static, params)
-    after_look = _expected_tracks
-    if static.max_tracks <= LARGEST_IN_ONE_KERNEL["max_tracks"]:
-        # Twice, for a `jax.vmap` over states of one over looks.
-        after_look = one_by_one(one_by_one(_expected_tracks))
-    tracks = after_look(state.tracks, look, params)
-    # Means are the same whatever was detected: taken from here, `jax.vmap` has them once for all looks.
-    tracks = tracks.replace(mean=kalman.predict(state.tracks, params.time_step, params).mean)
+    fits = static.max_tracks <= LARGEST_IN_ONE_KERNEL["max_tracks"]
+    tracks = (one_by_one(_expected_tracks) if fits else _expected_tracks)(state.tracks, look, params)
     scan_map = update_scan_map(state.scan_map, look, static, params)
     track, search = reward_terms(state.tracks, tracks, _no_truths(), scan_map, static, params)
     return state.replace(time=state.time + 1, tracks=tracks, scan_map=scan_map), track + search

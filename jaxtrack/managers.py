@@ -97,9 +97,13 @@ def rollout(
         best = jax.lax.top_k(expected, candidates)[1]
         actions = jax.vmap(to_action, in_axes=(0, None, None))(best, static, params)
         actions = jnp.concatenate([actions, base_policy(key, state)[None]])
-        returns = jax.vmap(
-            lambda action: expected_return(key, state, action, base_policy, horizon, discount, static, params)
-        )(actions)
+        # One look after the other: the maps after all of them, in many states, are more than a cache holds.
+        returns = jax.lax.map(
+            lambda action: expected_return(
+                key, state, action, base_policy, horizon, discount, static, params
+            ),
+            actions,
+        )
         return actions[jnp.argmax(returns)]
 
     return policy
