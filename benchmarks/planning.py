@@ -196,13 +196,18 @@ def make_row(
 HEADER = ("manager", "states", "decisions/s", "ratio", "compiled in")
 
 
+def written(speed: float) -> str:
+    """A speed with at least three digits."""
+    return f"{speed:,.0f}" if speed >= 100 else f"{speed:#.3g}"
+
+
 def cells(row: dict[str, Any]) -> list[str]:
     """The row under `HEADER`."""
     speed, seconds = row["decisions_per_second"], row["compile_seconds"]
     return [
         row["manager"],
         str(row["num_states"]),
-        f"{speed['median']:,.4g} ({speed['min']:,.4g} - {speed['max']:,.4g})",
+        "{} ({} - {})".format(*(written(speed[which]) for which in ("median", "min", "max"))),
         f"{row['ratio']:,.0f}",
         "" if seconds is None else f"{seconds:.1f} s",
     ]

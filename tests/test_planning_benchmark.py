@@ -76,6 +76,15 @@ def test_ours_counts_the_decisions_of_every_state(states, monkeypatch):
     assert speed == pytest.approx(4 * 3 / 5)
 
 
+def test_speeds_are_written_without_exponents():
+    assert [planning.written(speed) for speed in (1.5, 43.48, 376.5, 53580.0)] == [
+        "1.50",
+        "43.5",
+        "376",
+        "53,580",
+    ]
+
+
 def test_command_writes_all_and_prints_markdown(found, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(planning, "measure", lambda *_: {**found, "different_decisions": 0})
     file = tmp_path / "result.json"
