@@ -19,6 +19,7 @@ from jaxtrack.kernel import one_by_one
 from jaxtrack.lifecycle import delete_uncertain_tracks
 from jaxtrack.observation import covariance_norms
 from jaxtrack.params import Params, StaticParams
+from jaxtrack.policies import sum_in_beams
 from jaxtrack.reward import TRACK_TERMS, reward_terms
 from jaxtrack.scan_map import beam_means, beam_weights, mean_scan_value, update_scan_map
 from jaxtrack.sensor import in_beam, look_angles
@@ -60,7 +61,7 @@ def expected_rewards(
     predicted, updated = expected_outcomes(state.tracks, params)
     missed = _worths(state.tracks, predicted, static, params)
     gained = _worths(state.tracks, updated, static, params) - missed
-    track = jnp.sum(missed) + _sum_in_beams(gained, predicted, looks, params)
+    track = jnp.sum(missed) + sum_in_beams(gained, predicted, looks, params)
     aged = update_scan_map(state.scan_map, jnp.full(2, jnp.nan), static, params)  # NaN looks nowhere
     scan_value = mean_scan_value(aged) - pixels(aged) / aged.size
     return params.track_weight * track - params.search_weight * scan_value
@@ -73,7 +74,7 @@ def expected_falls(tracks: Tracks, looks: jax.Array, params: Params) -> jax.Arra
     """
     predicted, updated = expected_outcomes(tracks, params)
     fall = covariance_norms(predicted) - covariance_norms(updated)
-    return _sum_in_beams(fall, predicted, looks, params)
+    return sum_in_beams(fall, predicted, looks, params)
 
 
 def expected_step(
@@ -111,13 +112,6 @@ def _update_all(predicted: Tracks, params: Params) -> Tracks:
     expected = kalman.predict_detections(predicted, params)
     own = jnp.arange(predicted.active.shape[0])
     return kalman.update(predicted, expected, Detections.from_values(expected.mean), own)
-
-
-def _sum_in_beams(values: jax.Array, tracks: Tracks, looks: jax.Array, params: Params) -> jax.Array:
-    """Sum `[A]` of the values `[T]` of the live tracks in the beam of each of `looks` `[A, 2]`."""
-    # `[T, A]`: a CPU adds long rows, not columns, several numbers at a time.
-    inside = jax.vmap(in_beam, in_axes=(0, None, None))(position(tracks.mean), looks.T, params)
-    return jnp.sum(jnp.where(inside & tracks.active[:, None], values[:, None], 0.0), axis=0)
 
 
 def _worths(before: Tracks, after: Tracks, static: StaticParams, params: Params) -> jax.Array:

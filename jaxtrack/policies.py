@@ -126,8 +126,8 @@ def index(
 
     def policy(key: jax.Array, state: "EnvState") -> jax.Array:
         del key
-        inside = tracks_in_beams(state.tracks, looks, params)
-        urgency = inside @ trace_share(state.tracks, params) ** exponent
+        share = trace_share(state.tracks, params) ** exponent
+        urgency = sum_in_beams(share, state.tracks, looks, params)
         value = scan_weight * scan_values(state.scan_map) + urgency
         return to_action(jnp.argmax(value), static, params)
 
@@ -164,7 +164,8 @@ def trace_share(tracks: Tracks, params: Params) -> jax.Array:
     return jnp.where(tracks.active, trace / params.deletion_threshold, 0.0)
 
 
-def tracks_in_beams(tracks: Tracks, looks: jax.Array, params: Params) -> jax.Array:
-    """`[L * L, T]` 1 where a live track's mean lies in the beam of a look, else 0."""
-    inside = jax.vmap(in_beam, in_axes=(None, 0, None))(position(tracks.mean), looks, params)
-    return jnp.where(tracks.active, inside, False).astype(tracks.mean.dtype)
+def sum_in_beams(values: jax.Array, tracks: Tracks, looks: jax.Array, params: Params) -> jax.Array:
+    """Sum `[A]` of the values `[T]` of the live tracks in the beam of each of `looks` `[A, 2]`."""
+    # `[T, A]`: a CPU adds long rows, not columns, several numbers at a time.
+    inside = jax.vmap(in_beam, in_axes=(0, None, None))(position(tracks.mean), looks.T, params)
+    return jnp.sum(jnp.where(inside & tracks.active[:, None], values[:, None], 0.0), axis=0)
