@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, settings
+from jax._src import compiler
 
 from jaxtrack import Params, StaticParams, Tracks, Truths
 
@@ -30,12 +31,32 @@ def x64():
     jax.config.update("jax_enable_x64", before)
 
 
+@pytest.fixture(scope="session")
+def quick_code():
+    """Compiler options for XLA's older generator of code, three times quicker than its new one."""
+    options = {"xla_cpu_use_fusion_emitters": False}
+    try:
+        jax.jit(lambda: 0, compiler_options=options).lower().compile()
+    except jax.errors.JaxRuntimeError:  # a version without this option
+        return {}
+    return options
+
+
 @pytest.fixture(scope="module")
-def quick_compilation():
+def quick_compilation(quick_code):
     """Compiles without optimising, for programs that run for milliseconds."""
     before = jax.config.read("jax_disable_most_optimizations")
     jax.config.update("jax_disable_most_optimizations", True)
-    yield
+    # No setting of JAX holds options for all that is compiled, so they are added where it collects them.
+    collect = getattr(compiler, "get_compile_options", None)
+
+    def collect_more(*arguments, env_options_overrides=None, **named):
+        options = quick_code | (env_options_overrides or {})
+        return collect(*arguments, env_options_overrides=options, **named)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(compiler, "get_compile_options", collect_more, raising=False)
+        yield
     jax.config.update("jax_disable_most_optimizations", before)
 
 
