@@ -10,12 +10,12 @@ from jaxtrack.episode import EnvState
 from jaxtrack.observation import Observation, observe
 from jaxtrack.params import Params, StaticParams
 from jaxtrack.policies import Policy, PolicyBuilder
-from train.cells import CellGeometry, CellNetwork
+from train.beams import BeamGeometry, BeamNetwork
 from train.distributions import FACTORED, JOINT, Distribution
 from train.networks import ENCODERS, PaperNetwork
 
-AGENTS = ("cells", *ENCODERS)
-"""Names of the policies that can be trained: the per-cell one, then the paper's three."""
+AGENTS = ("beams", *ENCODERS)
+"""Names of the policies that can be trained: the beam policy, then the paper's three."""
 
 
 class Agent(NamedTuple):
@@ -48,8 +48,8 @@ def build_agent(name: str, static: StaticParams, params: Params) -> Agent:
     """
     if name not in AGENTS:
         raise ValueError(f"encoder = {name!r}: expected one of {', '.join(AGENTS)}")
-    if name == "cells":
-        return Agent(CellGeometry(static, params), CellNetwork(), JOINT)
+    if name == "beams":
+        return Agent(BeamGeometry(static, params), BeamNetwork(), JOINT)
     network = PaperNetwork(encoder=name, num_looks=static.num_looks)
     return Agent(lambda observation: observation, network, FACTORED)
 

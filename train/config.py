@@ -6,21 +6,21 @@ from pathlib import Path
 from typing import Any, get_args, get_origin
 
 from jaxtrack.params import Params, StaticParams, validate
+from jaxtrack.policies import POLICIES
 from train.agents import AGENTS
 from train.networks import ENCODERS
 from train.vision import SMALLEST_MAP
 
-LEARNING_RATES = {"cells": 1e-2, "paper": 1e-3}
-"""The per-cell network is small and its inputs are few: it bears ten times the usual rate."""
+NO_WARM_START = "none"
 
 
 @dataclasses.dataclass(frozen=True)
 class TrainConfig:
     """Everything a run depends on; saved beside its results as config.json."""
 
-    encoder: str = "cells"
-    """Policy to train: cells (one logit per look from per-cell features), or the paper's
-    track-list encoders flatten, bigru, mhsa."""
+    encoder: str = "beams"
+    """Policy to train: beams (what a beam would search and what the tracks in it need), or the
+    paper's track-list encoders flatten, bigru, mhsa."""
     total_steps: int = 750_000
     """Environment steps, rounded down to whole updates."""
     num_envs: int = 64
@@ -34,16 +34,21 @@ class TrainConfig:
     checkpoint_every: int = 20
     """Updates between checkpoints; one is always written at the end."""
 
+    warm_start: str = "index_tuned"
+    """Rule that the policy imitates at first, a baseline by name; none: it learns from rewards alone."""
+    warm_start_steps: int = 150_000
+    """Environment steps of that, out of the total, rounded down to whole updates."""
+
     rollout_steps: int = 128
     """Steps of every environment per update."""
     epochs: int = 4
     """Passes over the samples of an update."""
     num_minibatches: int = 8
     """Optimiser steps per pass."""
-    microbatch: int = 32
+    microbatch: int = 128
     """Samples per piece of a gradient, for the cache; changes nothing but speed."""
-    learning_rate: float | None = None
-    """Adam's step size at the start; unset, the encoder's own: 0.01 for cells, 0.001 for the others."""
+    learning_rate: float = 1e-3
+    """Adam's step size at the start."""
     anneal: bool = True
     """Let the learning rate fall to zero, linearly."""
     gamma: float = 0.99
@@ -67,12 +72,6 @@ class TrainConfig:
     """Numbers of the environment."""
 
     @property
-    def initial_rate(self) -> float:
-        """Learning rate at the start."""
-        own = LEARNING_RATES.get(self.encoder, LEARNING_RATES["paper"])
-        return own if self.learning_rate is None else self.learning_rate
-
-    @property
     def batch_size(self) -> int:
         """Samples per update."""
         return self.num_envs * self.rollout_steps
@@ -83,6 +82,11 @@ class TrainConfig:
         return self.batch_size // self.num_minibatches
 
     @property
+    def warm_start_updates(self) -> int:
+        """Updates in which the policy imitates a rule."""
+        return 0 if self.warm_start == NO_WARM_START else self.warm_start_steps // self.batch_size
+
+    @property
     def num_updates(self) -> int:
         """Updates of the whole run."""
         return self.total_steps // self.batch_size
@@ -90,7 +94,7 @@ class TrainConfig:
 
 _AT_LEAST_ONE = ("total_steps", "num_envs", "rollout_steps", "epochs", "num_minibatches", "microbatch")
 _SHARES = ("gamma", "gae_lambda")
-_POSITIVE = ("clip", "max_grad_norm", "reward_scale")
+_POSITIVE = ("learning_rate", "clip", "max_grad_norm", "reward_scale")
 _NOT_NEGATIVE = ("entropy_coefficient", "value_coefficient")
 
 
@@ -104,12 +108,13 @@ def check(config: TrainConfig) -> None:
         raise ValueError(f"encoder = {config.encoder!r}: expected one of {', '.join(AGENTS)}")
     for name in _AT_LEAST_ONE:
         _require(config, name, getattr(config, name) >= 1, "an integer >= 1")
-    for name in ("evaluation_episodes", "seed"):
+    teachers = (NO_WARM_START, *POLICIES)
+    _require(config, "warm_start", config.warm_start in teachers, f"one of {', '.join(teachers)}")
+    for name in ("evaluation_episodes", "seed", "warm_start_steps"):
         _require(config, name, getattr(config, name) >= 0, "an integer >= 0")
     _require(config, "checkpoint_every", config.checkpoint_every >= 1, "an integer >= 1")
     for name in _SHARES:
         _require(config, name, 0 <= getattr(config, name) <= 1, "a number in [0, 1]")
-    _require(config, "learning_rate", 0 < config.initial_rate < math.inf, "a number > 0")
     for name in _POSITIVE:
         _require(config, name, 0 < getattr(config, name) < math.inf, "a number > 0")
     for name in _NOT_NEGATIVE:

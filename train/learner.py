@@ -3,6 +3,7 @@
 Plain functions with explicit arguments; `train_step` is the table of contents.
 """
 
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -13,9 +14,14 @@ from flax import struct
 from jaxtrack.env import SearchTrack
 from jaxtrack.episode import EnvState
 from jaxtrack.params import Params
+from jaxtrack.policies import POLICIES
 from train.agents import Agent, build_agent
 from train.config import TrainConfig
 from train.gae import advantages
+from train.loss import Sample, explained_variance, ppo_loss
+
+Chooser = Callable[[jax.Array, EnvState, jax.Array], jax.Array]
+"""Key, states of the environments, and logits to actions `[B, 2]`."""
 
 LOGGED = ("completeness", "covariance_norm_mean", "covariance_norm_sum", "live_tracks", "mean_scan_value")
 
@@ -51,6 +57,7 @@ class Transition(struct.PyTreeNode):
 
     inputs: Any
     action: jax.Array
+    taught: jax.Array
     log_prob: jax.Array
     value: jax.Array
     final_value: jax.Array
@@ -59,20 +66,10 @@ class Transition(struct.PyTreeNode):
     done: jax.Array
 
 
-class Sample(struct.PyTreeNode):
-    """What the loss reads of one step; leading dimensions are whatever the batch has."""
-
-    inputs: Any
-    action: jax.Array
-    log_prob: jax.Array
-    value: jax.Array
-    advantage: jax.Array
-
-
 def make_optimiser(config: TrainConfig) -> optax.GradientTransformation:
     """Adam on gradients clipped by their global norm, with the learning rate annealed to zero."""
     steps = config.num_updates * config.epochs * config.num_minibatches
-    rate = optax.linear_schedule(config.initial_rate, 0.0, steps) if config.anneal else config.initial_rate
+    rate = optax.linear_schedule(config.learning_rate, 0.0, steps) if config.anneal else config.learning_rate
     return optax.chain(optax.clip_by_global_norm(config.max_grad_norm), optax.adam(rate, eps=1e-5))
 
 
@@ -123,11 +120,13 @@ def collect(
     key: jax.Array, state: LearnerState, env: SearchTrack, agent: Agent, config: TrainConfig
 ) -> tuple[LearnerState, Transition, dict[str, jax.Array]]:
     """Runs every environment for `rollout_steps` steps with the current weights."""
+    choose = build_chooser(state, env, agent, config)
+    taught = jnp.full(config.num_envs, state.update < config.warm_start_updates)
 
     def one_step(carry: LearnerState, key: jax.Array) -> tuple[LearnerState, tuple[Transition, Any, Any]]:
         key_action, key_env = jax.random.split(key)
         logits, value = agent.evaluate(carry.weights, carry.inputs)
-        action = agent.distribution.sample(key_action, logits)
+        action = choose(key_action, carry.env, logits)
         keys = jax.random.split(key_env, config.num_envs)
         observation, env_state, reward, terminated, truncated, info = jax.vmap(
             env.step, in_axes=(0, 0, 0, None)
@@ -136,6 +135,7 @@ def collect(
         transition = Transition(
             inputs=carry.inputs,
             action=action,
+            taught=taught,
             log_prob=agent.distribution.log_prob(logits, action),
             value=value,
             final_value=value_at_end(carry.weights, info["final_observation"], done, agent),
@@ -157,6 +157,25 @@ def collect(
     keys = jax.random.split(key, config.rollout_steps)
     state, (rollout, finished, logged) = jax.lax.scan(one_step, state, keys)
     return state, rollout, summarise(finished, logged, state.scenario)
+
+
+def build_chooser(state: LearnerState, env: SearchTrack, agent: Agent, config: TrainConfig) -> Chooser:
+    """How actions are chosen: by the policy, or in the first updates by the rule that it imitates."""
+
+    def by_policy(key: jax.Array, states: EnvState, logits: jax.Array) -> jax.Array:
+        del states
+        return agent.distribution.sample(key, logits)
+
+    if not config.warm_start_updates:
+        return by_policy
+    rule = POLICIES[config.warm_start](env.static, state.scenario)
+
+    def by_rule(key: jax.Array, states: EnvState, logits: jax.Array) -> jax.Array:
+        del logits
+        return jax.vmap(rule)(jax.random.split(key, config.num_envs), states)
+
+    imitates = state.update < config.warm_start_updates
+    return lambda *now: jax.lax.cond(imitates, by_rule, by_policy, *now)
 
 
 def value_at_end(weights: Any, final_observation: Any, done: jax.Array, agent: Agent) -> jax.Array:
@@ -187,7 +206,7 @@ def estimate_advantages(
         config.gamma,
         config.gae_lambda,
     )
-    return Sample(rollout.inputs, rollout.action, rollout.log_prob, rollout.value, advantage)
+    return Sample(rollout.inputs, rollout.action, rollout.taught, rollout.log_prob, rollout.value, advantage)
 
 
 def update_epochs(
@@ -241,32 +260,6 @@ def minibatch_gradient(
     return jax.tree.map(lambda leaf: leaf / pieces, total)
 
 
-def ppo_loss(
-    weights: Any,
-    samples: Sample,
-    advantage: jax.Array,
-    target: jax.Array,
-    agent: Agent,
-    config: TrainConfig,
-) -> tuple[jax.Array, dict[str, jax.Array]]:
-    """Clipped surrogate, value error and entropy (Schulman et al. 2017, eq. 9)."""
-    logits, value = agent.evaluate(weights, samples.inputs)
-    log_ratio = agent.distribution.log_prob(logits, samples.action) - samples.log_prob
-    ratio = jnp.exp(log_ratio)
-    clipped = jnp.clip(ratio, 1 - config.clip, 1 + config.clip)
-    policy_loss = -jnp.minimum(ratio * advantage, clipped * advantage).mean()
-    value_loss = 0.5 * jnp.square(value - target).mean()
-    entropy = agent.distribution.entropy(logits).mean()
-    loss = policy_loss + config.value_coefficient * value_loss - config.entropy_coefficient * entropy
-    return loss, {
-        "policy_loss": policy_loss,
-        "value_loss": value_loss,
-        "entropy": entropy,
-        "approximate_kl": ((ratio - 1) - log_ratio).mean(),
-        "clip_fraction": (jnp.abs(ratio - 1) > config.clip).mean(),
-    }
-
-
 def summarise(
     finished: dict[str, jax.Array], logged: dict[str, jax.Array], params: Params
 ) -> dict[str, jax.Array]:
@@ -279,9 +272,3 @@ def summarise(
     total = jnp.where(whole, finished["episode_return"], 0.0).sum()
     means = {name: values.mean() for name, values in logged.items()}
     return {**means, "episodes": count, "episode_return": jnp.where(count > 0, total / count, jnp.nan)}
-
-
-def explained_variance(value: jax.Array, advantage: jax.Array) -> jax.Array:
-    """Share of the returns' variance that the values explain; 1 is perfect."""
-    target = value + advantage
-    return 1 - advantage.var() / jnp.maximum(target.var(), 1e-12)

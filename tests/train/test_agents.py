@@ -9,7 +9,7 @@ from jaxtrack import Params, StaticParams
 from jaxtrack.env import SearchTrack
 from jaxtrack.observation import observe
 from train.agents import AGENTS, Agent, agent_policy, build_agent
-from train.cells import CellGeometry, CellNetwork
+from train.beams import BeamGeometry, BeamNetwork
 from train.distributions import FACTORED, JOINT
 
 pytestmark = pytest.mark.usefixtures("quick_compilation")
@@ -33,13 +33,13 @@ def shapes(agent):
     return [leaf.shape for leaf in jax.eval_shape(evaluate, jax.random.key(0))]
 
 
-def test_the_agents_are_the_per_cell_one_and_the_papers_three():
-    assert AGENTS == ("cells", "flatten", "bigru", "mhsa")
+def test_the_agents_are_the_beam_policy_and_the_papers_three():
+    assert AGENTS == ("beams", "flatten", "bigru", "mhsa")
 
 
-def test_cells_have_one_logit_per_look():
-    agent = build_agent("cells", STATIC, PARAMS)
-    assert isinstance(agent.network, CellNetwork)
+def test_beams_have_one_logit_per_look():
+    agent = build_agent("beams", STATIC, PARAMS)
+    assert isinstance(agent.network, BeamNetwork)
     assert agent.distribution is JOINT
     assert shapes(agent) == [(2, 16), (2,)]
 
@@ -53,7 +53,7 @@ def test_the_papers_networks_have_one_logit_per_index(name):
 
 
 def test_an_unknown_name_is_refused():
-    with pytest.raises(ValueError, match=r"^encoder = 'cnn': expected one of cells, flatten, bigru, mhsa$"):
+    with pytest.raises(ValueError, match=r"^encoder = 'cnn': expected one of beams, flatten, bigru, mhsa$"):
         build_agent("cnn", STATIC, PARAMS)
 
 
@@ -66,22 +66,22 @@ def state():
 
 @pytest.fixture(scope="module")
 def weights(state, draw_variables):
-    """Random weights of the per-cell network."""
-    inputs = CellGeometry(STATIC, PARAMS)(observe(state.tracks, state.scan_map, PARAMS))
-    return draw_variables(CellNetwork(), inputs)
+    """Random weights of the beam network."""
+    inputs = BeamGeometry(STATIC, PARAMS)(observe(state.tracks, state.scan_map, PARAMS))
+    return draw_variables(BeamNetwork(), inputs)
 
 
 def test_greedy_takes_the_most_probable_look(state, weights):
-    agent: Agent = build_agent("cells", STATIC, PARAMS)
+    agent: Agent = build_agent("beams", STATIC, PARAMS)
     logits, _ = agent.evaluate(weights, agent.features(observe(state.tracks, state.scan_map, PARAMS)))
-    greedy = jax.jit(agent_policy("cells", weights, greedy=True)(STATIC, PARAMS))
+    greedy = jax.jit(agent_policy("beams", weights, greedy=True)(STATIC, PARAMS))
     for seed in range(3):
         action = greedy(jax.random.key(seed), state)
         np.testing.assert_array_equal(action, np.unravel_index(np.argmax(logits), (4, 4)))
 
 
 def test_samples_follow_from_the_key_and_the_time(state, weights):
-    policy = agent_policy("cells", weights)(STATIC, PARAMS)
+    policy = agent_policy("beams", weights)(STATIC, PARAMS)
 
     @jax.jit
     def act(seeds, times):
@@ -93,7 +93,7 @@ def test_samples_follow_from_the_key_and_the_time(state, weights):
     over_time, over_keys = np.asarray(act(same, counts)), np.asarray(act(counts, same))
     np.testing.assert_array_equal(act(same, counts), over_time)
     np.testing.assert_array_equal(act(same, same), np.broadcast_to(over_time[0], (400, 2)))
-    agent = build_agent("cells", STATIC, PARAMS)
+    agent = build_agent("beams", STATIC, PARAMS)
     logits, _ = agent.evaluate(weights, agent.features(observe(state.tracks, state.scan_map, PARAMS)))
     expected = np.asarray(jax.nn.softmax(logits))
     for actions in (over_time, over_keys):

@@ -89,7 +89,7 @@ def test_sizes_follow_from_the_counts():
 
 
 def test_encoder_is_one_that_exists():
-    assert refusal(encoder="cnn") == "encoder = 'cnn': expected one of cells, flatten, bigru, mhsa"
+    assert refusal(encoder="cnn") == "encoder = 'cnn': expected one of beams, flatten, bigru, mhsa"
 
 
 def test_the_scenario_is_checked_too():

@@ -146,22 +146,22 @@ def test_a_run_must_fit_the_scenario():
 
 
 def test_runs_that_differ_in_their_seed_are_one_policy():
-    cells = TrainConfig(out="a")
-    longer = dataclasses.replace(cells, total_steps=10**6)
+    beams = TrainConfig(out="a")
+    longer = dataclasses.replace(beams, total_steps=10**6)
     mhsa = TrainConfig(encoder="mhsa", seed=4)
     runs = [
-        (Path("x/a"), cells, "weights of a"),
+        (Path("x/a"), beams, "weights of a"),
         (Path("x/m"), mhsa, "weights of m"),
-        (Path("x/b"), dataclasses.replace(cells, seed=1, out="b"), "weights of b"),
+        (Path("x/b"), dataclasses.replace(beams, seed=1, out="b"), "weights of b"),
     ]
     grouped = group_runs(runs, greedy=False)
-    assert list(grouped) == ["cells", "mhsa"]
-    assert grouped["cells"].seeds == (0, 1)
-    assert grouped["cells"].weights == ["weights of a", "weights of b"]
+    assert list(grouped) == ["beams", "mhsa"]
+    assert grouped["beams"].seeds == (0, 1)
+    assert grouped["beams"].weights == ["weights of a", "weights of b"]
     assert grouped["mhsa"].seeds == (4,)
-    assert list(group_runs([*runs, (Path("x/l"), longer, "l")], False)) == ["cells (a)", "mhsa", "cells (l)"]
+    assert list(group_runs([*runs, (Path("x/l"), longer, "l")], False)) == ["beams (a)", "mhsa", "beams (l)"]
     with pytest.raises(ValueError, match=r"^runs = 'x/again': seed 0 of this policy is given twice$"):
-        group_runs([*runs, (Path("x/again"), cells, "again")], greedy=False)
+        group_runs([*runs, (Path("x/again"), beams, "again")], greedy=False)
 
 
 def test_baselines_come_once_and_in_the_order_asked_for(monkeypatch):

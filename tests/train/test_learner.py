@@ -29,6 +29,7 @@ CONFIG = TrainConfig(
     gamma=0.5,
     entropy_coefficient=0.0,
     reward_scale=1.0,
+    warm_start="none",
 )
 
 
@@ -113,6 +114,25 @@ def test_the_policy_learns_what_the_observation_tells(traced):
     assert metrics["reward"][-1] > 0.95
     assert metrics["entropy"][-1] < metrics["entropy"][0] / 2
     np.testing.assert_allclose(metrics["entropy"][0], math.log(4), atol=0.1)
+
+
+def test_at_first_a_rule_is_imitated_whatever_it_earns(traced, monkeypatch):
+    def rule(static, params):
+        # The right look is the wrong one here.
+        return lambda key, state: jnp.where(state.coin == 1, jnp.array([0, 1]), jnp.array([1, 0]))
+
+    monkeypatch.setitem(learner.POLICIES, "wrong", rule)
+    probe = Probe(right_look, 4)
+    config = config_for(probe, warm_start="wrong", warm_start_steps=30 * CONFIG.batch_size + 1)
+    assert config.warm_start_updates == 30
+    _, metrics = learn(probe, config, 90)
+    assert (metrics["reward"][:30] == 0).all()
+    # The policy loss is the cross-entropy with the rule.
+    np.testing.assert_allclose(metrics["policy_loss"][0], math.log(4), atol=0.3)
+    assert metrics["policy_loss"][29] < 0.3
+    # On its own it does at first what it was taught, and then learns what pays.
+    assert metrics["reward"][30] < 0.3
+    assert metrics["reward"][-1] > 0.9
 
 
 @pytest.mark.parametrize("terminates", [False, True])

@@ -1,4 +1,4 @@
-"""The per-cell agent learns on a small scenario what its reward says, and nothing else."""
+"""The beam policy learns on a small scenario what its reward says, and nothing else."""
 
 import dataclasses
 
@@ -13,11 +13,17 @@ from train.config import TrainConfig
 pytestmark = pytest.mark.usefixtures("quick_compilation")
 
 
-def test_the_per_cell_agent_learns_what_the_reward_says():
+def test_the_beam_policy_learns_what_the_reward_says():
     static = StaticParams(3, 4, 3, 0, map_size=10, num_looks=5, reward="information")
     params = Params(max_steps_in_episode=40, time_step=0.05, beam_azimuth=0.6, beam_elevation=0.6)
     config = TrainConfig(
-        num_envs=16, rollout_steps=40, num_minibatches=4, microbatch=160, total_steps=20 * 640, anneal=False
+        num_envs=16,
+        rollout_steps=40,
+        num_minibatches=4,
+        microbatch=160,
+        total_steps=20 * 640,
+        anneal=False,
+        warm_start="none",
     )
     env = SearchTrack(static)
 

@@ -12,9 +12,10 @@ import pytest
 from jaxtrack import Params
 from train import learner
 from train.agents import Agent
-from train.cells import CellInputs, CellNetwork
+from train.beams import BeamInputs, BeamNetwork
 from train.config import TrainConfig
 from train.distributions import JOINT
+from train.loss import Sample, explained_variance, ppo_loss
 
 BASE = TrainConfig(
     num_envs=8, rollout_steps=8, num_minibatches=2, microbatch=16, learning_rate=0.03, anneal=False
@@ -35,16 +36,17 @@ BARE = Agent(
 WEIGHTS = {"logits": jnp.log(jnp.array([3.0, 1.0, 1.0, 1.0])), "value": jnp.array(2.0)}
 
 
-def loss_of(old_probability, advantage, config):
+def loss_of(old_probability, advantage, config, taught=False):
     """Loss, parts and gradient for one sample of look (0, 0) whose target is 5."""
-    sample = learner.Sample(
+    sample = Sample(
         inputs=jnp.zeros((1, 1)),
         action=jnp.zeros((1, 2), dtype=int),
+        taught=jnp.array([taught]),
         log_prob=jnp.log(jnp.array([old_probability])),
         value=jnp.zeros(1),
         advantage=jnp.zeros(1),
     )
-    loss = jax.value_and_grad(learner.ppo_loss, has_aux=True)
+    loss = jax.value_and_grad(ppo_loss, has_aux=True)
     return loss(WEIGHTS, sample, jnp.array([advantage]), jnp.array([5.0]), BARE, config)
 
 
@@ -68,6 +70,15 @@ def test_the_surrogate_is_clipped_on_the_side_that_gains(old_probability, advant
     assert (np.abs(gradient["logits"]).max() < 1e-6) == clipped
 
 
+@pytest.mark.parametrize("advantage", [-1.0, 1.0])
+def test_a_taught_action_is_imitated_whatever_it_earned(advantage):
+    config = dataclasses.replace(BASE, value_coefficient=0.0, entropy_coefficient=0.0)
+    (loss, parts), gradient = loss_of(0.25, advantage, config, taught=True)
+    # Cross-entropy of probability 1/2, and its gradient: probabilities less one where it was taught.
+    np.testing.assert_allclose([loss, parts["policy_loss"]], math.log(2), rtol=1e-5)
+    np.testing.assert_allclose(gradient["logits"], [-1 / 2, 1 / 6, 1 / 6, 1 / 6], rtol=1e-5)
+
+
 def test_value_error_entropy_and_divergence_by_hand():
     config = dataclasses.replace(BASE, value_coefficient=0.5, entropy_coefficient=0.1)
     (loss, parts), gradient = loss_of(0.25, 1.0, config)
@@ -83,12 +94,16 @@ def test_value_error_entropy_and_divergence_by_hand():
 def random_samples(count):
     """Samples as a rollout on four looks gives them."""
     rng = np.random.default_rng(0)
-    return learner.Sample(
-        inputs=CellInputs(
-            cells=jnp.asarray(rng.uniform(size=(count, 4, 5)), dtype=float),
-            context=jnp.asarray(rng.uniform(size=(count, 3)), dtype=float),
+    return Sample(
+        inputs=BeamInputs(
+            search=jnp.asarray(rng.uniform(size=(count, 6, 4)) / 50, dtype=float),
+            inside=jnp.asarray(rng.uniform(size=(count, 2, 4)) < 0.4),
+            tracks=jnp.asarray(rng.uniform(size=(count, 2, 9)) / 50, dtype=float),
+            mask=jnp.asarray(rng.uniform(size=(count, 2)) < 0.8),
+            context=jnp.asarray(rng.uniform(size=(count, 6)), dtype=float),
         ),
         action=jnp.asarray(rng.integers(0, 2, (count, 2))),
+        taught=jnp.asarray(rng.uniform(size=count) < 0.3),
         log_prob=jnp.asarray(rng.normal(-1.4, 0.2, count), dtype=float),
         value=jnp.asarray(rng.normal(size=count), dtype=float),
         advantage=jnp.asarray(rng.normal(3, 2, count), dtype=float),
@@ -97,7 +112,7 @@ def random_samples(count):
 
 def test_the_microbatch_changes_nothing(draw_variables):
     samples = random_samples(16)
-    network = CellNetwork(width=4)
+    network = BeamNetwork(width=4)
     weights = draw_variables(network, samples.inputs)
     agent = Agent(lambda observation: observation, network, JOINT)
     config = dataclasses.replace(BASE, rollout_steps=4, num_minibatches=2, entropy_coefficient=0.1)
@@ -112,7 +127,7 @@ def test_the_microbatch_changes_nothing(draw_variables):
         # The loss over the whole minibatch, its advantages normalised.
         advantage = samples.advantage
         normalised = (advantage - advantage.mean()) / advantage.std()
-        whole = jax.grad(learner.ppo_loss, has_aux=True)(
+        whole = jax.grad(ppo_loss, has_aux=True)(
             weights, samples, normalised, samples.value + advantage, agent, config
         )
         return [*in_pieces, whole]
@@ -145,9 +160,9 @@ def test_gradients_are_scaled_down_to_the_largest_norm():
 
 def test_explained_variance():
     value, advantage = jnp.array([1.0, 2.0, 3.0]), jnp.zeros(3)
-    assert learner.explained_variance(value, advantage) == 1
+    assert explained_variance(value, advantage) == 1
     # Values that say nothing explain nothing.
-    np.testing.assert_allclose(learner.explained_variance(jnp.zeros(3), value), 0.0, atol=1e-6)
+    np.testing.assert_allclose(explained_variance(jnp.zeros(3), value), 0.0, atol=1e-6)
 
 
 def test_without_a_whole_episode_the_return_is_nan():

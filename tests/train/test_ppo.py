@@ -89,9 +89,9 @@ def test_a_whole_run_leaves_all_its_files(whole):
     for name in PICTURES:
         assert (folder / name).stat().st_size > 1000
     results = json.loads((folder / "results.json").read_text())
-    assert list(results["policies"]) == ["cells", *BASELINES]
-    assert results["policies"]["cells"]["training_seeds"] == [0]
-    assert list(results["policies"]["cells"]["metrics"]) == list(METRICS)
+    assert list(results["policies"]) == ["beams", *BASELINES]
+    assert results["policies"]["beams"]["training_seeds"] == [0]
+    assert list(results["policies"]["beams"]["metrics"]) == list(METRICS)
     lines = (folder / "episodes.csv").read_text().splitlines()
     assert len(lines) == 1 + 2 * (1 + len(BASELINES))
     assert set(json.loads((folder / "config.json").read_text())["static"]) == set(vars(StaticParams()))
@@ -114,7 +114,7 @@ def test_a_whole_run_can_be_evaluated_again(whole, tmp_path, capsys):
     before, after = (
         (path / "episodes.csv").read_text().splitlines() for path in (folder, tmp_path / "again")
     )
-    own = [line.split(",")[1:] for line in before if line.startswith("cells")]
+    own = [line.split(",")[1:] for line in before if line.startswith("beams")]
     again = [line.split(",")[1:] for line in after[1:]]
     again, own = (np.array([[cell or "nan" for cell in row] for row in rows], float) for rows in (again, own))
     np.testing.assert_allclose(again, own, rtol=1e-4)
@@ -203,7 +203,7 @@ def test_the_same_seed_gives_the_same_numbers(whole, tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["--encoder", "cnn"], "encoder = 'cnn': expected one of cells, flatten, bigru, mhsa"),
+        (["--encoder", "cnn"], "encoder = 'cnn': expected one of beams, flatten, bigru, mhsa"),
         (["--params.time-step", "-1"], "time_step = -1.0: expected a number in (0"),
         (["--params.range-sigma", "nan"], "range_sigma = nan: expected a number in (0"),
         (["--num-minibatches", "64"], "num_minibatches = 64: expected a divisor of"),

@@ -1,0 +1,126 @@
+"""The beam policy: a look is worth what its beam would search plus what the tracks in it need.
+
+It is the index rule with its numbers learned. The picture as a whole sets the prices of what
+there is to search; a small network, the same for all tracks, says how urgent a look at each one
+is. Which tracks lie in which beam is known from the geometry, not learned. One softmax over the
+worths of all looks decides.
+"""
+
+import jax
+import jax.numpy as jnp
+from flax import linen as nn
+from flax import struct
+
+from jaxtrack.models import direction
+from jaxtrack.observation import Observation
+from jaxtrack.params import Params, StaticParams
+from jaxtrack.scan_map import beam_means, look_grid
+from jaxtrack.sensor import in_beam, look_number
+
+LOGIT_SCALE = 50.0
+"""Good looks differ from poor ones by a few hundredths of a scan value: small weights must
+be able to tell them apart by several nats, or the policy stays almost uniform."""
+
+NEVER_SEEN = 0.9999
+"""Scan value above which a pixel counts as never looked at."""
+
+SHARPNESS = 4
+"""Power of the scan value that tells what was never seen from what was seen long ago."""
+
+
+class BeamInputs(struct.PyTreeNode):
+    """What the beam network reads, K = L * L looks.
+
+    Attributes:
+        search: `[..., 6, K]` of every look: mean scan value s in its beam; s to the power of
+            `SHARPNESS`; mean n of s over the eight looks around it, 0 outside the field; s times n;
+            its azimuth and elevation, per limit of the field.
+        inside: `[..., T, K]` whether a track lies in the beam of a look.
+        tracks: `[..., T, 9]` the observation's features, the root of the covariance norm, and s of
+            the look nearest to the track.
+        mask: `[..., T]` where there is a track.
+        context: `[..., 6]` share of slots in use; mean scan value; share of the field never seen;
+            mean, mean root and maximum of the covariance norms.
+    """
+
+    search: jax.Array  # [..., 6, K]
+    inside: jax.Array  # [..., T, K] bool
+    tracks: jax.Array  # [..., T, 9]
+    mask: jax.Array  # [..., T] bool
+    context: jax.Array  # [..., 6]
+
+
+class BeamGeometry:
+    """Turns observations into `BeamInputs`; holds what is fixed by the parameters."""
+
+    def __init__(self, static: StaticParams, params: Params) -> None:
+        self.static, self.params = static, params
+        self.looks = look_grid(static, params)
+        self.scan_values = beam_means(static, params)
+
+    def __call__(self, observation: Observation) -> BeamInputs:
+        """Inputs of one observation (no batch dimension)."""
+        mask, scan_map = observation["mask"], observation["scan_map"]
+        # Empty rows may hold anything: replace them before any arithmetic.
+        tracks = jnp.where(mask[:, None], observation["tracks"], 0.0)
+        angles, norm = tracks[:, 1:3] * self.params.field_limit, tracks[:, 6]
+        towards = direction(angles[:, 0], angles[:, 1])
+        scan_value = self.scan_values(scan_map)
+        nearest = jax.vmap(look_number, in_axes=(0, None, None))(angles, self.static, self.params)
+        own = jnp.stack([jnp.sqrt(norm), jnp.where(mask, scan_value[nearest], 0.0)], axis=-1)
+        return BeamInputs(
+            search=self._search(scan_value),
+            # `[T, K]`: a CPU works along long rows.
+            inside=in_beam(towards[:, None], self.looks.T, self.params) & mask[:, None],
+            tracks=jnp.concatenate([tracks, own], axis=-1),
+            mask=mask,
+            context=self._context(norm, mask, scan_map),
+        )
+
+    def _search(self, scan_value: jax.Array) -> jax.Array:
+        around = mean_of_neighbours(scan_value.reshape(self.static.num_looks, -1)).ravel()
+        places = self.looks.T / self.params.field_limit
+        return jnp.stack(
+            [scan_value, scan_value**SHARPNESS, around, scan_value * around, places[0], places[1]]
+        )
+
+    def _context(self, norm: jax.Array, mask: jax.Array, scan_map: jax.Array) -> jax.Array:
+        number = jnp.maximum(mask.sum(), 1)
+        never_seen = (scan_map > NEVER_SEEN).mean()
+        norms = [norm.sum() / number, jnp.sqrt(norm).sum() / number, norm.max()]
+        return jnp.stack([mask.mean(), scan_map.mean(), never_seen, *norms])
+
+
+def mean_of_neighbours(grid: jax.Array) -> jax.Array:
+    """Mean `[L, L]` over the eight neighbours of every place of a grid; outside it, all is 0."""
+    padded = jnp.pad(grid, 1)
+    rows = padded[:-2] + padded[1:-1] + padded[2:]
+    return (rows[:, :-2] + rows[:, 1:-1] + rows[:, 2:] - grid) / 8
+
+
+class BeamNetwork(nn.Module):
+    """Prices of searching from the whole picture, urgencies from every track, and a value."""
+
+    width: int = 32
+
+    @nn.compact
+    def __call__(self, inputs: BeamInputs) -> tuple[jax.Array, jax.Array]:
+        """Logits `[..., K]` over the looks (azimuth index first) and value `[...]`."""
+        context = nn.relu(_dense(self.width, "context")(inputs.context))
+        tracks = _dense(self.width, "tracks")(inputs.tracks)
+        tracks += _dense(self.width, "tracks_in_context")(context)[..., None, :]
+        tracks = nn.relu(_dense(self.width, "hidden")(nn.relu(tracks)))
+        tracks = jnp.where(inputs.mask[..., None], tracks, 0.0)
+        picture = jnp.concatenate([tracks.mean(axis=-2), context], axis=-1)
+
+        urgencies = jnp.where(inputs.mask, _dense(1, "urgency", 0.01)(tracks)[..., 0], 0.0)
+        priced = nn.relu(_dense(self.width, "picture")(picture))
+        prices = _dense(inputs.search.shape[-2], "prices", 0.01)(priced)
+        worth = jnp.einsum("...j,...jk->...k", prices, inputs.search)
+        worth += jnp.sum(jnp.where(inputs.inside, urgencies[..., None], 0.0), axis=-2)
+        valued = nn.relu(_dense(2 * self.width, "valued")(picture))
+        return LOGIT_SCALE * worth, _dense(1, "value", 1.0)(valued)[..., 0]
+
+
+def _dense(features: int, name: str, gain: float = 2**0.5) -> nn.Dense:
+    return nn.Dense(features, kernel_init=nn.initializers.orthogonal(gain), name=name)
