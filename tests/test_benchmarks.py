@@ -15,6 +15,8 @@ from jaxtrack.report import PACKAGES
 from reference.simulation import StoneSoupScenario
 from reference.truths import initial_states, truth_simulator
 
+pytestmark = pytest.mark.usefixtures("quick_compilation")
+
 STATIC = StaticParams(num_truths=4, max_tracks=8, max_detections=4, map_size=12, num_looks=7)
 # Seven looks per axis cover the field only with a wide beam.
 PARAMS = Params(beam_azimuth=0.5, beam_elevation=0.5)
