@@ -9,6 +9,8 @@ import pytest
 from train.distributions import FACTORED
 from train.networks import ENCODERS, PaperNetwork
 
+pytestmark = pytest.mark.usefixtures("quick_compilation")
+
 B, T, L = 6, 5, 19
 
 
