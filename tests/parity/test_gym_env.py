@@ -21,6 +21,8 @@ from reference.parity.environment import (
     environment_rows,
 )
 
+pytestmark = pytest.mark.usefixtures("quick_compilation")
+
 STEPS = 110
 SMALL = StaticParams(num_truths=3, max_tracks=6, map_size=12, num_looks=7)
 
