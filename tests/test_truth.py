@@ -18,6 +18,8 @@ from jaxtrack.truth import (
 )
 from jaxtrack.types import position, velocity
 
+pytestmark = pytest.mark.usefixtures("quick_compilation")
+
 MANY = StaticParams(num_truths=4000)
 initiate = jax.jit(initiate_truths, static_argnums=1)
 propagate = jax.jit(propagate_truths)
