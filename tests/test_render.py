@@ -15,6 +15,8 @@ from jaxtrack.env import make
 from jaxtrack.models import direction
 from jaxtrack.sensor import in_beam
 
+pytestmark = pytest.mark.usefixtures("quick_compilation")
+
 STEPS = 24
 
 
