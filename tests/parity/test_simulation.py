@@ -19,6 +19,8 @@ from reference.simulation import StoneSoupScenario
 from reference.translate import as_vector, to_tracks, track_key
 from reference.truths import initial_states, num_initial, truth_simulator
 
+pytestmark = pytest.mark.usefixtures("quick_compilation")
+
 STATIC = StaticParams(num_truths=6, max_tracks=9, map_size=24)
 UPDATE_MAP = jax.jit(scan_map.update_scan_map, static_argnums=2)
 
