@@ -8,6 +8,8 @@ from flax import linen as nn
 
 from train.vision import Convolution, NatureCNN, convolve_by_matmul
 
+pytestmark = pytest.mark.usefixtures("quick_compilation")
+
 
 class ReferenceNatureCNN(nn.Module):
     """The same network of flax's own layers."""
