@@ -8,6 +8,8 @@ from flax import linen as nn
 
 from train.encoders import GRU, AttentionEncoder, BiGRUEncoder, FlattenEncoder, SelfAttention
 
+pytestmark = pytest.mark.usefixtures("quick_compilation")
+
 ENCODERS = [FlattenEncoder(), BiGRUEncoder(), AttentionEncoder()]
 each_encoder = pytest.mark.parametrize("encoder", ENCODERS, ids=["flatten", "bigru", "mhsa"])
 MASK = jnp.array(
