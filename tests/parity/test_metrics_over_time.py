@@ -16,6 +16,8 @@ from reference.parity.scenes import AHEAD, random_means, random_tracks
 from reference.parity.stock_metrics import StockRecord, pcrb_of_path, track_to_truth
 from reference.translate import as_vector, to_ground_truth_paths, track_key
 
+pytestmark = pytest.mark.usefixtures("quick_compilation")
+
 EVENTS = ["break", "swap", "return", "dated back", "miss", "shared", "spurious", "replaced", "no track"]
 EVENTS += ["no truth"]
 NUMBERS = [
@@ -35,7 +37,6 @@ def records():
     ]
 
 
-@pytest.mark.usefixtures("quick_compilation")
 @pytest.mark.parametrize("comparison", COMPARISONS, ids=lambda one: one.component)
 def test_metrics_over_records(comparison, records):
     row = compare(comparison, records)
@@ -45,7 +46,6 @@ def test_metrics_over_records(comparison, records):
     assert row.compared >= 3 * len(records)
 
 
-@pytest.mark.usefixtures("quick_compilation")
 def test_a_limit_spares_the_slow_ones(records):
     rows = list(metric_rows(records[:2], limit=1))
     assert [row.component for row in rows] == [one.component for one in COMPARISONS]
@@ -97,7 +97,6 @@ def overlap(stock, associations):
     return max(counts) > 1
 
 
-@pytest.mark.usefixtures("quick_compilation")
 def test_the_switching_penalty_is_paid_in_the_random_records(records):
     (comparison,) = (one for one in COMPARISONS if one.switching)
     found = our_numbers(comparison, records[1], double=True)["switching"]
@@ -134,7 +133,6 @@ def widened(leaf, rows, order):
     return np.concatenate([leaf, padding], axis=1)[:, order]
 
 
-@pytest.mark.usefixtures("quick_compilation")
 def test_vmap_equals_a_loop_and_empty_rows_and_the_order_of_slots_change_nothing(short_records):
     records, times = short_records
     thresholds = np.array([60.0, 120.0, 200.0])
@@ -160,7 +158,6 @@ def test_vmap_equals_a_loop_and_empty_rows_and_the_order_of_slots_change_nothing
         jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9), found, expected)
 
 
-@pytest.mark.usefixtures("quick_compilation")
 def test_pcrb_with_another_prior_less_information_and_a_gap():
     rng = np.random.default_rng(3)
     params = Params(time_step=0.05)
