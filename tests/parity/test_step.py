@@ -10,6 +10,8 @@ from reference.pipeline import StoneSoupTracker
 
 from .stepping import check_step
 
+pytestmark = pytest.mark.usefixtures("quick_compilation")
+
 # Measured: 2.7e-4 standard deviations at most over the scenes below.
 FLOAT32_TOLERANCE = 1e-3
 # Measured: 1.4e-7 at most here, away from the axes; see test_initiate_delete for elsewhere.
