@@ -184,6 +184,7 @@ def floating(record):
 loss_and_gradient = jax.jit(jax.value_and_grad(loss, argnums=(0, 1, 2), has_aux=True, allow_int=True))
 
 
+@pytest.mark.usefixtures("quick_compilation")
 def test_gradients_are_finite_and_blind_to_empty_rows(x64, tracks, detections):
     params = jax.tree.map(lambda number: jnp.asarray(float(number)), Params(time_step=DT))
     _, clean = loss_and_gradient(params, tracks, detections)
