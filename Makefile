@@ -33,7 +33,7 @@ train: setup
 	echo "make train took $$(( $$(date +%s) - started )) s"
 
 test: setup
-	@started=$$(date +%s); $(MAKE) --no-print-directory lint && $(BIN)/pytest -n auto $(ARGS) && \
+	@started=$$(date +%s); $(MAKE) --no-print-directory lint && $(BIN)/pytest -n auto --dist loadfile $(ARGS) && \
 	echo "make test took $$(( $$(date +%s) - started )) s"
 
 slow: setup

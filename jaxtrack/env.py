@@ -159,7 +159,7 @@ class SearchTrack(environment.Environment[EnvState, Params]):
     ) -> Observation:
         """Track list, mask and scan map; deterministic."""
         del key, action
-        return observe(state.tracks, state.scan_map, params)
+        return observe(state.tracks, state.scan_map, params, self.static.observe_variances)
 
     def is_terminated(self, state: EnvState, params: Params) -> jax.Array:
         """Whether the stop metric exceeds its threshold; without one, never."""
@@ -175,16 +175,17 @@ class SearchTrack(environment.Environment[EnvState, Params]):
         return spaces.Indices(self.static.num_looks, (2,))
 
     def observation_space(self, params: Params) -> spaces.Dict:
-        """Dictionary of track features, mask and scan map."""
+        """Dictionary of track features, mask and scan map, and of the variances if there are any."""
         del params
         tracks, pixels = self.static.max_tracks, self.static.map_size
-        return spaces.Dict(
-            {
-                "tracks": spaces.Box(-jnp.inf, jnp.inf, (tracks, TRACK_FEATURES), jnp.float32),
-                "mask": spaces.Box(0, 1, (tracks,), jnp.bool_),
-                "scan_map": spaces.Box(0.0, 1.0, (pixels, pixels), jnp.float32),
-            }
-        )
+        boxes = {
+            "tracks": spaces.Box(-jnp.inf, jnp.inf, (tracks, TRACK_FEATURES), jnp.float32),
+            "mask": spaces.Box(0, 1, (tracks,), jnp.bool_),
+            "scan_map": spaces.Box(0.0, 1.0, (pixels, pixels), jnp.float32),
+        }
+        if self.static.observe_variances:
+            boxes["variances"] = spaces.Box(0.0, jnp.inf, (tracks, 2), jnp.float32)
+        return spaces.Dict(boxes)
 
 
 def step_info(

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 
 from jaxtrack.models import elevation_bearing_range
 from jaxtrack.params import Params
-from jaxtrack.types import STATE_DIM, Tracks, velocity
+from jaxtrack.types import STATE_DIM, Tracks, position, velocity
 
 TRACK_FEATURES = 7
 """Range, azimuth, elevation, vx, vy, vz, Frobenius norm of the covariance."""
@@ -13,17 +13,22 @@ TRACK_FEATURES = 7
 Observation = dict[str, jax.Array]
 
 
-def observe(tracks: Tracks, scan_map: jax.Array, params: Params) -> Observation:
+def observe(tracks: Tracks, scan_map: jax.Array, params: Params, with_variances: bool = False) -> Observation:
     """The observation.
 
     Returns:
         `tracks` `[T, 7]` scaled features, zero where there is no track; `mask` `[T]` where
-        there is one; `scan_map` `[M, M]` in [0, 1].
+        there is one; `scan_map` `[M, M]` in [0, 1]; and if asked for, `variances` `[T, 2]` of
+        position and of velocity, each summed over the axes, per deletion threshold.
     """
     features = track_features(tracks) / feature_scales(params)
     # Reading row r of a slot that is empty must give exact zeros, whatever it holds.
     padded = jnp.where(tracks.active[:, None], features, 0.0)
-    return {"tracks": padded, "mask": tracks.active, "scan_map": scan_map}
+    observation = {"tracks": padded, "mask": tracks.active, "scan_map": scan_map}
+    if with_variances:
+        shares = variances(tracks) / params.deletion_threshold
+        observation["variances"] = jnp.where(tracks.active[:, None], shares, 0.0)
+    return observation
 
 
 def track_features(tracks: Tracks) -> jax.Array:
@@ -38,6 +43,12 @@ def track_features(tracks: Tracks) -> jax.Array:
         ],
         axis=-1,
     )
+
+
+def variances(tracks: Tracks) -> jax.Array:
+    """Sums `[T, 2]` over the axes of the variances of position (m^2) and of velocity (m^2/s^2)."""
+    of_state = jnp.diagonal(tracks.covariance, axis1=-2, axis2=-1)
+    return jnp.stack([position(of_state).sum(axis=-1), velocity(of_state).sum(axis=-1)], axis=-1)
 
 
 def feature_scales(params: Params) -> jax.Array:

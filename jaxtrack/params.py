@@ -62,6 +62,8 @@ class StaticParams:
     """Looks along each axis of the field."""
     continuous_actions: bool = False
     """Actions are (azimuth, elevation) in radians instead of two look indices."""
+    observe_variances: bool = False
+    """The observation also has `variances`, of position and of velocity of every track (not the paper's)."""
     reward: str = "paper"
     """Reward by name: paper, as_printed, information or gospa (which reads the truths)."""
     info_metrics: tuple[str, ...] = ()

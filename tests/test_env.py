@@ -18,6 +18,7 @@ from jaxtrack.observation import observe
 from jaxtrack.params import METRICS
 
 SHAPES = {
+    "observe_variances": True,
     "num_truths": 3,
     "max_tracks": 4,
     "max_detections": 3,
@@ -102,7 +103,8 @@ def test_every_observation_lies_in_the_space_and_pads_with_zeros(env, episode):
     for observation, state in episode[0]:
         assert bool(contains(observation))
         assert not bool(jnp.any(observation["tracks"][~observation["mask"]]))
-        chex.assert_trees_all_close(observation, observe(state.tracks, state.scan_map, PARAMS), rtol=1e-5)
+        expected = observe(state.tracks, state.scan_map, PARAMS, with_variances=True)
+        chex.assert_trees_all_close(observation, expected, rtol=1e-5)
     most = max(int(observation["mask"].sum()) for observation, _ in episode[0])
     assert most >= 3  # else the padding has hardly been tested
 

@@ -1,5 +1,6 @@
 """What the agent sees, by hand."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -35,6 +36,15 @@ def test_empty_slots_read_exactly_zero_whatever_they_hold(tracks_at, params):
     np.testing.assert_array_equal(observation["tracks"][jnp.array([0, 2])], np.zeros((2, 7)))
     np.testing.assert_array_equal(observation["mask"], [False, True, False])
     assert bool(jnp.all(observation["tracks"][1] != 0))
+
+
+def test_variances_are_shown_where_they_are_asked_for(tracks_at):
+    params = Params(deletion_threshold=100.0)
+    tracks = tracks_at([MEAN] * 2, 2).replace(active=jnp.array([True, False]))
+    observation = observe(tracks, jnp.zeros((2, 2)), params, with_variances=True)
+    np.testing.assert_allclose(observation.pop("variances"), [[3.0, 12.0], [0.0, 0.0]], rtol=1e-6)
+    plain = observe(tracks, jnp.zeros((2, 2)), params)
+    jax.tree.map(np.testing.assert_array_equal, observation, plain)
 
 
 def test_the_scan_map_is_shown_as_it_is(tracks_at, params):

@@ -65,14 +65,15 @@ def inside(points, azimuth, elevation):
     return bearing & (np.abs(np.arctan2(z, np.hypot(x, y))) <= PARAMS.beam_elevation / 2)
 
 
-def by_look(state, exponent=1.0):
+def by_look(state, exponent=1.0, position_weight=1.0):
     """Mean scan value and, summed over tracks, powers of trace per threshold: `[L, L]` each, in numpy."""
     angles = np.linspace(-LIMIT, LIMIT, M)
     pixels = unit(*np.meshgrid(angles, angles)).reshape(-1, 3)
     values = np.asarray(state.scan_map, dtype=np.float64).ravel()
     tracks = np.asarray(state.tracks.mean, dtype=np.float64)[:, 0::2]
     active = np.asarray(state.tracks.active)
-    shares = np.trace(np.asarray(state.tracks.covariance), axis1=1, axis2=2) / PARAMS.deletion_threshold
+    of_state = np.diagonal(np.asarray(state.tracks.covariance, dtype=np.float64), axis1=1, axis2=2)
+    shares = of_state @ np.array([position_weight, 1.0] * 3) / PARAMS.deletion_threshold
     scan, share = np.zeros((L, L)), np.zeros((L, L))
     for i, azimuth in enumerate(np.linspace(-LIMIT, LIMIT, L)):
         for j, elevation in enumerate(np.linspace(-LIMIT, LIMIT, L)):
@@ -177,15 +178,20 @@ def test_index_weighs_both_terms():
     assert [act("index", state) for state in states] == chosen
 
 
-@pytest.mark.parametrize(("exponent", "scan_weight"), [(0.3, 1.0), (1.0, 5.0), (3.0, 0.5)])
-def test_index_with_other_numbers(exponent, scan_weight):
-    build = functools.partial(index, exponent=exponent, scan_weight=scan_weight)
+@pytest.mark.parametrize(
+    ("exponent", "scan_weight", "sharpness", "position_weight"),
+    [(0.3, 1.0, 1, 1.0), (1.0, 5.0, 1, 1.0), (3.0, 0.5, 1, 1.0), (1.0, 1.0, 4, 1.0), (1.0, 1.0, 1, 30.0)],
+)
+def test_index_with_other_numbers(exponent, scan_weight, sharpness, position_weight):
+    numbers = {"exponent": exponent, "scan_weight": scan_weight}
+    numbers |= {"sharpness": sharpness, "position_weight": position_weight}
+    build = functools.partial(index, **numbers)
     moved = 0
     for seed in range(8):
         state = scene(seed)
-        scan, share = by_look(state, exponent)
+        scan, share = by_look(state, exponent, position_weight)
         action = build(STATIC, PARAMS)(jax.random.key(0), state).tolist()
-        assert action == largest(scan_weight * scan + share)
+        assert action == largest(scan_weight * scan**sharpness + share)
         moved += action != act("index", state)
     assert moved > 0, "in these scenes the numbers matter"
 

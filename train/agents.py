@@ -61,7 +61,7 @@ def agent_policy(name: str, weights: Any, greedy: bool = False) -> PolicyBuilder
         agent = build_agent(name, static, params)
 
         def policy(key: jax.Array, state: EnvState) -> jax.Array:
-            observation = observe(state.tracks, state.scan_map, params)
+            observation = observe(state.tracks, state.scan_map, params, static.observe_variances)
             inputs = jax.tree.map(lambda leaf: leaf[None], agent.features(observation))
             logits, _ = agent.evaluate(weights, inputs)
             if greedy:

@@ -14,7 +14,7 @@ from flax import struct
 from jaxtrack.models import direction
 from jaxtrack.observation import Observation
 from jaxtrack.params import Params, StaticParams
-from jaxtrack.scan_map import beam_means, look_grid
+from jaxtrack.scan_map import beam_means, beam_weights, look_grid
 from jaxtrack.sensor import in_beam, look_number
 
 LOGIT_SCALE = 50.0
@@ -32,20 +32,21 @@ class BeamInputs(struct.PyTreeNode):
     """What the beam network reads, K = L * L looks.
 
     Attributes:
-        search: `[..., 6, K]` of every look: mean scan value s in its beam; s to the power of
-            `SHARPNESS`; mean n of s over the eight looks around it, 0 outside the field; s times n;
-            its azimuth and elevation, per limit of the field.
+        search: `[..., 7, K]` of every look: mean scan value s in its beam; s to the power of
+            `SHARPNESS`; s times the pixels in the beam, per largest number of them; mean n of s over
+            the eight looks around it, 0 outside the field; s times n; its azimuth and elevation, per
+            limit of the field.
         inside: `[..., T, K]` whether a track lies in the beam of a look.
-        tracks: `[..., T, 9]` the observation's features, the root of the covariance norm, and s of
-            the look nearest to the track.
+        tracks: `[..., T, F]` the observation's features, the root of the covariance norm, s of the
+            look nearest to the track, and where they are observed the variances and their roots.
         mask: `[..., T]` where there is a track.
         context: `[..., 6]` share of slots in use; mean scan value; share of the field never seen;
             mean, mean root and maximum of the covariance norms.
     """
 
-    search: jax.Array  # [..., 6, K]
+    search: jax.Array  # [..., 7, K]
     inside: jax.Array  # [..., T, K] bool
-    tracks: jax.Array  # [..., T, 9]
+    tracks: jax.Array  # [..., T, F]
     mask: jax.Array  # [..., T] bool
     context: jax.Array  # [..., 6]
 
@@ -57,6 +58,8 @@ class BeamGeometry:
         self.static, self.params = static, params
         self.looks = look_grid(static, params)
         self.scan_values = beam_means(static, params)
+        pixels = jnp.sum(beam_weights(static, params) > 0, axis=1)
+        self.areas = pixels / pixels.max()
 
     def __call__(self, observation: Observation) -> BeamInputs:
         """Inputs of one observation (no batch dimension)."""
@@ -67,12 +70,15 @@ class BeamGeometry:
         towards = direction(angles[:, 0], angles[:, 1])
         scan_value = self.scan_values(scan_map)
         nearest = jax.vmap(look_number, in_axes=(0, None, None))(angles, self.static, self.params)
-        own = jnp.stack([jnp.sqrt(norm), jnp.where(mask, scan_value[nearest], 0.0)], axis=-1)
+        own = [tracks, jnp.sqrt(norm)[:, None], jnp.where(mask, scan_value[nearest], 0.0)[:, None]]
+        if "variances" in observation:
+            variances = jnp.where(mask[:, None], observation["variances"], 0.0)
+            own += [variances, jnp.sqrt(variances)]
         return BeamInputs(
             search=self._search(scan_value),
             # `[T, K]`: a CPU works along long rows.
             inside=in_beam(towards[:, None], self.looks.T, self.params) & mask[:, None],
-            tracks=jnp.concatenate([tracks, own], axis=-1),
+            tracks=jnp.concatenate(own, axis=-1),
             mask=mask,
             context=self._context(norm, mask, scan_map),
         )
@@ -80,9 +86,8 @@ class BeamGeometry:
     def _search(self, scan_value: jax.Array) -> jax.Array:
         around = mean_of_neighbours(scan_value.reshape(self.static.num_looks, -1)).ravel()
         places = self.looks.T / self.params.field_limit
-        return jnp.stack(
-            [scan_value, scan_value**SHARPNESS, around, scan_value * around, places[0], places[1]]
-        )
+        own = [scan_value, scan_value**SHARPNESS, scan_value * self.areas]
+        return jnp.stack([*own, around, scan_value * around, *places])
 
     def _context(self, norm: jax.Array, mask: jax.Array, scan_map: jax.Array) -> jax.Array:
         number = jnp.maximum(mask.sum(), 1)

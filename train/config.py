@@ -21,7 +21,7 @@ class TrainConfig:
     encoder: str = "beams"
     """Policy to train: beams (what a beam would search and what the tracks in it need), or the
     paper's track-list encoders flatten, bigru, mhsa."""
-    total_steps: int = 750_000
+    total_steps: int = 1_500_000
     """Environment steps, rounded down to whole updates."""
     num_envs: int = 64
     """Environments that run side by side."""
@@ -39,7 +39,7 @@ class TrainConfig:
     warm_start_steps: int = 150_000
     """Environment steps of that, out of the total, rounded down to whole updates."""
 
-    rollout_steps: int = 128
+    rollout_steps: int = 256
     """Steps of every environment per update."""
     epochs: int = 4
     """Passes over the samples of an update."""
@@ -51,7 +51,7 @@ class TrainConfig:
     """Adam's step size at the start."""
     anneal: bool = True
     """Let the learning rate fall to zero, linearly."""
-    gamma: float = 0.99
+    gamma: float = 0.995
     """Discount per step."""
     gae_lambda: float = 0.95
     """Decay of the advantage estimate."""
@@ -66,9 +66,11 @@ class TrainConfig:
     reward_scale: float = 0.1
     """Factor on rewards in the learner, so that values are near 1; logged returns are unscaled."""
 
-    static: StaticParams = dataclasses.field(default_factory=lambda: StaticParams(reward="information"))
+    static: StaticParams = dataclasses.field(
+        default_factory=lambda: StaticParams(reward="information", observe_variances=True)
+    )
     """Shapes of the environment."""
-    params: Params = dataclasses.field(default_factory=Params)
+    params: Params = dataclasses.field(default_factory=lambda: Params(search_weight=0.1))
     """Numbers of the environment."""
 
     @property

@@ -35,7 +35,7 @@ COMPARED_SEED = 1_000_000
 """Seed of the scenarios on which policies are compared, far from the seeds of training."""
 
 ALL, PLANNERS = "all", "planners"
-IMPORTANT_SHAPES = ("max_tracks", "map_size", "num_looks", "continuous_actions")
+IMPORTANT_SHAPES = ("max_tracks", "map_size", "num_looks", "continuous_actions", "observe_variances")
 """Shapes that fix an agent's inputs and outputs."""
 UNIMPORTANT = ("seed", "out", "evaluation_episodes", "checkpoint_every")
 """Options of a training in which two runs of the same policy may differ."""

@@ -19,7 +19,17 @@ from train.results import RANKED, Summary
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-STYLES = ("-", "--", "-.", ":", (0, (7, 2)), (0, (4, 1, 1, 1, 1, 1)), (0, (1, 3)), (0, (9, 3, 2, 3)))
+STYLES = (
+    "-",
+    "--",
+    "-.",
+    ":",
+    (0, (7, 2)),
+    (0, (4, 1, 1, 1, 1, 1)),
+    (0, (1, 3)),
+    (0, (9, 3, 2, 3)),
+    (0, (5, 1)),
+)
 SHADES = ("0.0", "0.45", "0.25", "0.6")
 COVARIANCE = ("covariance_x", "covariance_y", "covariance_z", "covariance_norm")
 GOSPA = ("gospa", "gospa_localisation", "gospa_missed", "gospa_false")
@@ -89,7 +99,7 @@ def over_time(
         label_ends(axes, ends)
     handles = panels[0].get_legend_handles_labels()
     figure.legend(
-        *handles, loc="outside lower center", ncols=min(len(played), 7), fontsize=8.5, handlelength=3.5
+        *handles, loc="outside lower center", ncols=min(len(played), 5), fontsize=8.5, handlelength=3.5
     )
     figure.savefig(out_png)
 
