@@ -30,6 +30,12 @@ LARGEST_IN_ONE_KERNEL = {"max_tracks": 200, "num_truths": 100, "max_detections":
 """Larger scenarios are stepped all at once: XLA spreads their arrays over threads, one kernel can not."""
 
 
+def one_by_one_if_small(function: Function, static: StaticParams) -> Function:
+    """`one_by_one`, unless the scenario is larger than `LARGEST_IN_ONE_KERNEL`: then `function` as it is."""
+    fits = all(getattr(static, name) <= largest for name, largest in LARGEST_IN_ONE_KERNEL.items())
+    return one_by_one(function) if fits else function
+
+
 class SearchTrack(environment.Environment[EnvState, Params]):
     """Search and track with a steerable radar (paper, section III).
 
@@ -71,7 +77,9 @@ class SearchTrack(environment.Environment[EnvState, Params]):
         last, moved, reward, terminated, info = self.step_env(key_step, state, action, params)
         truncated = self.is_truncated(moved, params)
         done = terminated | truncated
-        truths = self._one_by_one(self._initiate_truths_if)(done, key_reset, moved.truths, params)
+        truths = one_by_one_if_small(self._initiate_truths_if, self.static)(
+            done, key_reset, moved.truths, params
+        )
         first = self._begin(key_reset, truths, params)
         observation, state = jax.tree.map(lambda new, old: jnp.where(done, new, old), first, (last, moved))
         ended = {"terminated": terminated, "truncated": truncated, "final_observation": last}
@@ -113,7 +121,9 @@ class SearchTrack(environment.Environment[EnvState, Params]):
         """`advance` with noise from the key, fast for many scenarios; the record lacks the `tracker`."""
         # The map is the same work for all and the larger part of the state: it stays outside.
         without_map = state.replace(scan_map=None)
-        moved, record = self._one_by_one(self._draw_and_track)(key, without_map, action, params)
+        moved, record = one_by_one_if_small(self._draw_and_track, self.static)(
+            key, without_map, action, params
+        )
         scan_map = update_scan_map(state.scan_map, record.look, self.static, params)
         return moved.replace(scan_map=scan_map), record
 
@@ -124,11 +134,6 @@ class SearchTrack(environment.Environment[EnvState, Params]):
         moved, record = self._look_and_track(state, action, noise, params)
         scan_map = update_scan_map(state.scan_map, record.look, self.static, params)
         return moved.replace(scan_map=scan_map), record
-
-    def _one_by_one(self, function: Function) -> Function:
-        sizes = vars(self.static)
-        fits = all(sizes[name] <= largest for name, largest in LARGEST_IN_ONE_KERNEL.items())
-        return one_by_one(function) if fits else function
 
     def _draw_and_track(
         self, key: jax.Array, state: EnvState, action: jax.Array, params: Params

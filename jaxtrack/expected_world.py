@@ -14,14 +14,13 @@ import jax
 import jax.numpy as jnp
 
 from jaxtrack import kalman
-from jaxtrack.env import LARGEST_IN_ONE_KERNEL
-from jaxtrack.kernel import one_by_one
+from jaxtrack.env import one_by_one_if_small
 from jaxtrack.lifecycle import delete_uncertain_tracks
 from jaxtrack.observation import covariance_norms
 from jaxtrack.params import Params, StaticParams
 from jaxtrack.policies import sum_in_beams
 from jaxtrack.reward import TRACK_TERMS, reward_terms
-from jaxtrack.scan_map import beam_means, beam_weights, mean_scan_value, update_scan_map
+from jaxtrack.scan_map import beam_means, beam_sizes, mean_scan_value, update_scan_map
 from jaxtrack.sensor import in_beam, look_angles
 from jaxtrack.types import Detections, Tracks, Truths, position, where_rows
 
@@ -34,9 +33,8 @@ BeamSums = Callable[[jax.Array], jax.Array]
 
 def beam_pixels(static: StaticParams, params: Params) -> BeamSums:
     """The sums over the pixels in the beam of every look of `look_grid`."""
-    means = beam_means(static, params)
-    number = jnp.sum(beam_weights(static, params) > 0, axis=1)
-    return lambda scan_map: number * means(scan_map)
+    means, sizes = beam_means(static, params), beam_sizes(static, params)
+    return lambda scan_map: sizes * means(scan_map)
 
 
 def expected_rewards(
@@ -82,8 +80,7 @@ def expected_step(
 ) -> tuple["EnvState", jax.Array]:
     """One step of the expected world: the state after it, truths untouched, and the reward."""
     look = look_angles(action, static, params)
-    fits = static.max_tracks <= LARGEST_IN_ONE_KERNEL["max_tracks"]
-    tracks = (one_by_one(_expected_tracks) if fits else _expected_tracks)(state.tracks, look, params)
+    tracks = one_by_one_if_small(_expected_tracks, static)(state.tracks, look, params)
     scan_map = update_scan_map(state.scan_map, look, static, params)
     track, search = reward_terms(state.tracks, tracks, _no_truths(), scan_map, static, params)
     return state.replace(time=state.time + 1, tracks=tracks, scan_map=scan_map), track + search

@@ -87,6 +87,11 @@ def beam_weights(static: StaticParams, params: Params) -> jax.Array:
     return inside / jnp.maximum(inside.sum(axis=-1, keepdims=True), 1)
 
 
+def beam_sizes(static: StaticParams, params: Params) -> jax.Array:
+    """Number `[L * L]` of pixels in the beam of every look."""
+    return jnp.sum(beam_weights(static, params) > 0, axis=1)
+
+
 def beam_means(static: StaticParams, params: Params) -> Callable[[jax.Array], jax.Array]:
     """The function of a map `[M, M]` that gives the mean scan value in the beam of every look `[L * L]`.
 

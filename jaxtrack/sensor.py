@@ -115,6 +115,12 @@ def in_beam(points: jax.Array, look: jax.Array, params: Params) -> jax.Array:
     return in_bearing & in_elevation
 
 
+def in_beams(points: jax.Array, looks: jax.Array, params: Params) -> jax.Array:
+    """`[T, A]` whether points `[T, 3]` lie in the beams of looks `[A, 2]`."""
+    # The looks come last: a CPU works on several numbers at a time only along long rows.
+    return in_beam(points[:, None], looks.T, params)
+
+
 def detect(
     truths: Truths, look: jax.Array, noise: SensorNoise, static: StaticParams, params: Params
 ) -> tuple[Detections, jax.Array]:

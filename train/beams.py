@@ -14,8 +14,8 @@ from flax import struct
 from jaxtrack.models import direction
 from jaxtrack.observation import Observation
 from jaxtrack.params import Params, StaticParams
-from jaxtrack.scan_map import beam_means, beam_weights, look_grid
-from jaxtrack.sensor import in_beam, look_number
+from jaxtrack.scan_map import beam_means, beam_sizes, look_grid
+from jaxtrack.sensor import in_beams, look_number
 
 LOGIT_SCALE = 50.0
 """Good looks differ from poor ones by a few hundredths of a scan value: small weights must
@@ -58,8 +58,8 @@ class BeamGeometry:
         self.static, self.params = static, params
         self.looks = look_grid(static, params)
         self.scan_values = beam_means(static, params)
-        pixels = jnp.sum(beam_weights(static, params) > 0, axis=1)
-        self.areas = pixels / pixels.max()
+        sizes = beam_sizes(static, params)
+        self.areas = sizes / sizes.max()
 
     def __call__(self, observation: Observation) -> BeamInputs:
         """Inputs of one observation (no batch dimension)."""
@@ -76,8 +76,7 @@ class BeamGeometry:
             own += [variances, jnp.sqrt(variances)]
         return BeamInputs(
             search=self._search(scan_value),
-            # `[T, K]`: a CPU works along long rows.
-            inside=in_beam(towards[:, None], self.looks.T, self.params) & mask[:, None],
+            inside=in_beams(towards, self.looks, self.params) & mask[:, None],
             tracks=jnp.concatenate(own, axis=-1),
             mask=mask,
             context=self._context(norm, mask, scan_map),
