@@ -1,66 +1,236 @@
-"""Checkpoints of a run, by orbax: the whole learner state, the last two kept.
+"""Checkpoints of a run: the whole learner state, sealed with its SHA-256, the last two kept.
 
-Nothing is unpickled: orbax writes arrays and JSON.
+`checkpoints/UPDATE.npz` holds the arrays by name and, as JSON under `about`, the configuration and what it
+was written with; nothing is unpickled. NumPy's format rather than orbax: a whole state is one file, quickly
+written, and orbax loads damaged numbers without a word (docs/reliability.md).
 """
 
+import dataclasses
+import io
 import json
-import logging
+import os
+import platform
+from collections.abc import Callable
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import jax
-import orbax.checkpoint as ocp
+import jax.numpy as jnp
+import numpy as np
 
 from jaxtrack.env import SearchTrack, make
-from train.config import TrainConfig, from_dict, to_dict
+from jaxtrack.report import circumstances
+from train.config import TrainConfig, check, first_difference, from_dict, to_dict
 from train.learner import LearnerState, init_learner
+from train.sealed import check_seal, read_json, remove_sealed, seal_of, write_sealed, write_whole
 
 KEPT = 2
-logging.getLogger("absl").setLevel(logging.ERROR)
+FORMAT = 1
+"""Raised when an older program could misread what is written."""
+ABOUT = "about"
+
+Say = Callable[[str], None]
 
 
-def open_manager(folder: Path) -> ocp.CheckpointManager:
-    """Manager of the checkpoints below a run's folder."""
-    options = ocp.CheckpointManagerOptions(max_to_keep=KEPT, create=True)
-    return ocp.CheckpointManager((folder / "checkpoints").absolute(), options=options)
+class IncompatibleError(ValueError):
+    """An intact checkpoint that this program can not use."""
 
 
-def save(manager: ocp.CheckpointManager, state: LearnerState) -> None:
-    """Writes the learner state under its number of updates, whole or not at all."""
+@dataclasses.dataclass(frozen=True)
+class Checkpoint:
+    """An intact checkpoint.
+
+    Attributes:
+        update: updates done.
+        config: the run's configuration, as in config.json.
+        written_with: versions and machine, flat.
+        metrics_digest: of the rows of metrics.csv up to here.
+        arrays: leaves of the learner state by their names.
+    """
+
+    update: int
+    config: dict[str, Any]
+    written_with: dict[str, Any]
+    metrics_digest: str
+    arrays: dict[str, np.ndarray]
+
+
+def save(folder: Path, state: LearnerState, config: TrainConfig, metrics_digest: str = "") -> None:
+    """Writes the learner state under its number of updates, and removes checkpoints that are no longer kept.
+
+    Raises:
+        OSError: naming the file; the checkpoints that were there still are.
+    """
     update = int(state.update)
-    if manager.latest_step() != update:
-        manager.save(update, args=ocp.args.StandardSave(state))
-        manager.wait_until_finished()
+    about = {
+        "format": FORMAT,
+        "update": update,
+        "config": to_dict(config),
+        "written_with": written_with(),
+        "metrics_digest": metrics_digest,
+    }
+    buffer = io.BytesIO()
+    np.savez(buffer, allow_pickle=False, **{ABOUT: np.array(json.dumps(about))}, **_by_name(state))
+    (folder / "checkpoints").mkdir(exist_ok=True)
+    write_sealed(_path(folder, update), buffer.getvalue())
+    # One of a later update is what a resumed training found damaged.
+    kept = [each for each in updates(folder) if each <= update][-KEPT:]
+    for other in set(updates(folder)) - set(kept):
+        remove_sealed(_path(folder, other))
+
+
+def updates(folder: Path) -> list[int]:
+    """Updates with a checkpoint, intact or not, in ascending order."""
+    names = (path for path in (folder / "checkpoints").glob("*") if path.suffix in (".npz", ".json"))
+    return sorted({int(path.stem) for path in names if path.stem.isdecimal()})
+
+
+def load_newest(folder: Path, say: Say = print) -> Checkpoint | None:
+    """The newest intact checkpoint, None if none was ever finished; what is damaged is said.
+
+    Raises:
+        ValueError: if there are checkpoints, but none of them is intact or can be used.
+    """
+    found = updates(folder)
+    finished = [update for update in found if seal_of(_path(folder, update)).exists()]
+    for update in reversed(found):
+        try:
+            checkpoint = _read(folder, update)
+        except IncompatibleError:
+            raise
+        except Exception as error:  # whatever damage does to the readers of JSON, zip and NumPy files
+            say(f"{folder}: the checkpoint of update {update} is damaged ({_one_line(error)})")
+            continue
+        say(f"{folder}: using the checkpoint of update {update}")
+        return checkpoint
+    if finished:
+        raise ValueError(
+            f"run = {str(folder)!r}: none of its checkpoints is intact: {', '.join(map(str, found))}"
+        )
+    return None
+
+
+def _read(folder: Path, update: int) -> Checkpoint:
+    path = _path(folder, update)
+    check_seal(path)
+    with np.load(path, allow_pickle=False) as file:
+        arrays = {name: file[name] for name in file.files}
+    about = json.loads(str(arrays.pop(ABOUT)))
+    if about["format"] > FORMAT:
+        raise IncompatibleError(
+            f"{path}: has format {about['format']}, expected at most {FORMAT}; "
+            f"it was written with jaxtrack {about['written_with']['jaxtrack']}"
+        )
+    if about["update"] != update:
+        raise ValueError(f"{path.name} holds update {about['update']}")
+    return Checkpoint(update, about["config"], about["written_with"], about["metrics_digest"], arrays)
+
+
+def restore(checkpoint: Checkpoint, shapes: LearnerState) -> LearnerState:
+    """The learner state of a checkpoint.
+
+    Args:
+        checkpoint: an intact one.
+        shapes: a learner state with the shapes and types that are expected.
+
+    Raises:
+        ValueError: naming the first array that does not fit.
+    """
+    expected = _by_name(shapes)
+    for name in sorted({*expected, *checkpoint.arrays}):
+        ours, theirs = (_kind(side.get(name)) for side in (expected, checkpoint.arrays))
+        if ours != theirs:
+            wrote = checkpoint.written_with.get("jaxtrack")
+            raise ValueError(
+                f"checkpoint of update {checkpoint.update}: {name} is {theirs}, expected {ours}; it was "
+                f"written with jaxtrack {wrote}"
+            )
+    leaves = [jnp.asarray(checkpoint.arrays[name]) for name in expected]
+    return jax.tree.unflatten(jax.tree.structure(shapes), leaves)
+
+
+def learner_shapes(env: SearchTrack, config: TrainConfig) -> LearnerState:
+    """Shapes and types of the learner state, without computing one."""
+    init = lambda key, params: init_learner(key, params, env, config)  # noqa: E731
+    return jax.eval_shape(init, jax.random.key(config.seed), config.params)
+
+
+def written_with() -> dict[str, Any]:
+    """Versions and machine, as far as results may depend on them."""
+    about = circumstances()
+    packages = {name: version(name) for name in ("flax", "optax")}
+    devices = {"devices": jax.device_count(), "platform": platform.machine()}
+    options = {"XLA_FLAGS": os.environ.get("XLA_FLAGS", "")}
+    return {**about["versions"], **packages, **about["machine"], **devices, **options}
 
 
 def write_config(folder: Path, config: TrainConfig) -> None:
     """Writes the run's configuration as config.json."""
-    (folder / "config.json").write_text(json.dumps(to_dict(config), indent=2) + "\n")
+    write_whole(folder / "config.json", (json.dumps(to_dict(config), indent=2) + "\n").encode())
 
 
-def load_run(folder: Path) -> tuple[TrainConfig, SearchTrack, Any]:
+def read_config(folder: Path) -> tuple[TrainConfig, dict[str, Any]]:
+    """A run's configuration, checked, and the same as it stands in config.json.
+
+    Raises:
+        ValueError: naming the folder or the file.
+    """
+    path = folder / "config.json"
+    try:
+        values = read_json(path)
+    except OSError:
+        raise ValueError(f"run = {str(folder)!r}: expected a folder with a config.json") from None
+    try:
+        config = from_dict(values)
+        check(dataclasses.replace(config, out=""))
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from None
+    return config, values
+
+
+def read_run(folder: Path, say: Say = print) -> tuple[TrainConfig, Checkpoint | None]:
+    """Configuration and newest intact checkpoint of a run, which must agree.
+
+    Raises:
+        ValueError: naming the folder or the file, if it holds no readable run.
+    """
+    config, values = read_config(folder)
+    checkpoint = load_newest(folder, say)
+    if checkpoint is not None and (found := first_difference(values, checkpoint.config)):
+        name, here, there = found
+        raise ValueError(
+            f"{folder / 'config.json'}: {name} = {here!r}, but the checkpoint was trained with {there!r}"
+        )
+    return config, checkpoint
+
+
+def load_run(folder: Path, say: Say = print) -> tuple[TrainConfig, SearchTrack, Any]:
     """Configuration, environment and latest weights of a run.
 
     Raises:
         ValueError: naming the folder, if it holds no readable run.
     """
-    config = _read_run_config(folder)
-    env, params = make(config.params, config.static)
-    if not (folder / "checkpoints").is_dir():
+    config, checkpoint = read_run(folder, say)
+    env, _ = make(config.params, config.static)
+    if checkpoint is None:
         raise ValueError(f"run = {str(folder)!r}: holds no checkpoint")
-    shapes = jax.eval_shape(lambda: init_learner(jax.random.key(0), params, env, config))
-    with open_manager(folder) as manager:
-        if manager.latest_step() is None:
-            raise ValueError(f"run = {str(folder)!r}: holds no checkpoint")
-        state = manager.restore(manager.latest_step(), args=ocp.args.StandardRestore(shapes))
-    return config, env, state.weights
+    return config, env, restore(checkpoint, learner_shapes(env, config)).weights
 
 
-def _read_run_config(folder: Path) -> TrainConfig:
-    path = folder / "config.json"
-    try:
-        return from_dict(json.loads(path.read_text()))
-    except OSError:
-        raise ValueError(f"run = {str(folder)!r}: expected a folder with a config.json") from None
-    except json.JSONDecodeError as error:
-        raise ValueError(f"{path}: {error}") from None
+def _path(folder: Path, update: int) -> Path:
+    return folder / "checkpoints" / f"{update}.npz"
+
+
+def _by_name(state: Any) -> dict[str, Any]:
+    """Leaves by name, such as `weights/params/Dense_0/kernel`, in the order of the tree."""
+    leaves = jax.tree.leaves_with_path(state)
+    return {jax.tree_util.keystr(path, simple=True, separator="/"): leaf for path, leaf in leaves}
+
+
+def _kind(leaf: Any) -> str:
+    return "missing" if leaf is None else f"{np.dtype(leaf.dtype).name}{list(leaf.shape)}"
+
+
+def _one_line(error: Exception) -> str:
+    return " ".join(str(error).split()) or type(error).__name__

@@ -160,6 +160,17 @@ def to_dict(config: TrainConfig) -> dict[str, Any]:
     return dataclasses.asdict(config)
 
 
+def first_difference(these: Any, those: Any, name: str = "") -> tuple[str, Any, Any] | None:
+    """Name and both values of the first field, by name, in which two nested dictionaries differ."""
+    if not (isinstance(these, dict) and isinstance(those, dict)):
+        return None if these == those else (name, these, those)
+    for key in sorted({*these, *those}):
+        inner = f"{name}.{key}" if name else key
+        if found := first_difference(these.get(key), those.get(key), inner):
+            return found
+    return None
+
+
 def from_dict(values: dict[str, Any]) -> TrainConfig:
     """Inverse of `to_dict`; missing fields keep their defaults.
 

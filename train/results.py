@@ -18,6 +18,7 @@ from jaxtrack.report import circumstances
 from train import statistics
 from train.episode_metrics import CURVES, METRICS
 from train.episodes import Comparison, Played
+from train.sealed import write_whole
 from train.statistics import Estimate
 
 RANKED = {"gospa": True, "completeness": False, "uncertainty_per_truth": True}
@@ -99,9 +100,11 @@ def write_results(
         "differences": _nested(summary.differences),
         "probability_of_improvement": summary.improvement,
     }
-    (folder / "results.json").write_text(json.dumps(_plain(document), indent=1, allow_nan=False) + "\n")
     _write_episodes(comparison.played, folder / "episodes.csv")
     _write_curves(comparison.played, params, folder / "curves.npz")
+    # The last one: it tells a resumed training that nothing is left to do.
+    text = json.dumps(_plain(document), indent=1, allow_nan=False) + "\n"
+    write_whole(folder / "results.json", text.encode())
 
 
 def _numbers(params: Params) -> dict[str, Any]:

@@ -1,13 +1,9 @@
-"""`python -m train.ppo` from the command line to its files: whole, interrupted, refused."""
+"""`python -m train.ppo` from the command line to its files: whole, interrupted, resumed, refused."""
 
 import csv
 import json
 import os
 import signal
-import subprocess
-import sys
-import time
-from pathlib import Path
 
 import jax
 import numpy as np
@@ -17,13 +13,13 @@ from jaxtrack import StaticParams
 from jaxtrack.cli import run
 from jaxtrack.policies import POLICIES
 from train import evaluate, ppo
-from train.checkpoint import load_run
+from train.checkpoint import load_newest, load_run, updates
 from train.episode_metrics import METRICS
 from train.figures import FIGURES
+from train.metrics_file import CLOCK, MetricsFile
 
 pytestmark = pytest.mark.usefixtures("quick_compilation")
 
-ROOT = Path(__file__).resolve().parents[2]
 BASELINES = {name: POLICIES[name] for name in ("static", "coverage")}
 PICTURES = ["learning_curve.png", "episode.gif", *(f"{name}.png" for name in FIGURES)]
 SIZES = {
@@ -74,7 +70,7 @@ def read_rows(folder):
 
 def checkpoints(folder):
     """Updates of the checkpoints in a run's folder."""
-    return sorted(int(path.name) for path in (folder / "checkpoints").iterdir())
+    return updates(folder)
 
 
 def test_a_whole_run_leaves_all_its_files(whole):
@@ -120,46 +116,147 @@ def test_a_whole_run_can_be_evaluated_again(whole, tmp_path, capsys):
     np.testing.assert_allclose(again, own, rtol=1e-4)
 
 
-def train_again(whole, folder, monkeypatch, **changes):
-    """Another run on what the whole run compiled; the exit code."""
-    state, compiled = whole[2]
-    compiled = changes.pop("compiled", compiled)
-    monkeypatch.setattr(ppo, "compile_training", lambda *_: (jax.device_put(state), compiled))
-    return ppo.main([*SMALL, "--evaluation-episodes", "0", "--out", str(folder)])
+@pytest.fixture
+def go(whole, monkeypatch):
+    """Runs the command on what the whole run compiled; gives the exit code."""
+
+    def command(*arguments, compiled=whole[2][1]):
+        def compile_nothing(run, env, console):
+            state = ppo.first_state(run, env) if run.checkpoint else jax.device_put(whole[2][0])
+            return state, compiled
+
+        with monkeypatch.context() as patch:
+            patch.setattr(ppo, "compile_training", compile_nothing)
+            return ppo.main(list(map(str, arguments)))
+
+    return command
 
 
-def test_the_first_interrupt_finishes_the_update_and_writes_a_checkpoint(
-    whole, tmp_path, monkeypatch, capsys
+@pytest.fixture
+def start(go):
+    """A new run in a folder, without evaluation."""
+    return lambda folder, *more, **named: go(
+        *SMALL, "--evaluation-episodes", 0, "--out", folder, *more, **named
+    )
+
+
+@pytest.fixture
+def stop_at(monkeypatch):
+    """Sends the process a signal when it has written the row of an update."""
+
+    def plan(update, number=signal.SIGINT, write=MetricsFile.write):
+        def write_and_stop(self, row):
+            write(self, row)
+            if row["update"] == update:
+                os.kill(os.getpid(), number)
+
+        monkeypatch.setattr(MetricsFile, "write", write_and_stop)
+
+    return plan
+
+
+def assert_same_result(folder, reference):
+    """Bit for bit: the whole last learner state, and the metrics but for the clock's columns."""
+    one, other = load_newest(folder), load_newest(reference)
+    assert one.update == other.update
+    assert list(one.arrays) == list(other.arrays)
+    for name, array in one.arrays.items():
+        assert array.dtype == other.arrays[name].dtype
+        np.testing.assert_array_equal(array, other.arrays[name], strict=True)
+    assert without_clock(folder) == without_clock(reference)
+
+
+def without_clock(folder):
+    """The rows of metrics.csv without the columns that no two runs share."""
+    return [{name: cell for name, cell in row.items() if name not in CLOCK} for row in read_rows(folder)]
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_the_first_signal_finishes_the_update_and_writes_a_checkpoint(
+    start, stop_at, tmp_path, capsys, number, code
 ):
-    def write_and_interrupt(file, row, write=ppo.write_row):
-        write(file, row)
-        if row["update"] == 1:
-            os.kill(os.getpid(), signal.SIGINT)
-
     before = signal.getsignal(signal.SIGINT)
-    monkeypatch.setattr(ppo, "write_row", write_and_interrupt)
+    stop_at(1, number)
     folder = tmp_path / "run"
-    assert train_again(whole, folder, monkeypatch) == 130
+    assert start(folder) == code
     assert len(read_rows(folder)) == 1
     assert checkpoints(folder) == [1]
     load_run(folder)
     said = " ".join(capsys.readouterr().out.split())
     assert "stopped after 1 updates; checkpoint of update 1 in" in said
+    assert f"continue with: python -m train.ppo --resume {folder}" in said
     assert "python -m train.evaluate --run" in said
     assert signal.getsignal(signal.SIGINT) is before
 
 
-def test_a_second_interrupt_stops_at_once():
-    with ppo.Interrupt() as interrupt:
-        signal.raise_signal(signal.SIGTERM)
-        assert interrupt.signal == signal.SIGTERM
-        with pytest.raises(KeyboardInterrupt):
-            signal.raise_signal(signal.SIGINT)
+def test_a_resumed_training_ends_as_if_it_had_never_stopped(whole, start, go, stop_at, tmp_path, capsys):
+    folder = tmp_path / "run"
+    stop_at(1)
+    assert start(folder) == 130
+    stop_at(2)
+    assert go("--resume", folder) == 130
+    rows = (folder / "metrics.csv").read_text()
+    # What a kill leaves behind: rows after the checkpoint, the last one cut short.
+    (folder / "metrics.csv").write_text(rows + rows.splitlines()[-1] + "\r\n3,96,0.")
+    assert go("--resume", folder) == 0
+    assert_same_result(folder, whole[0])
+    assert f"{folder}: using the checkpoint of update 2" in capsys.readouterr().out
+    seconds = [float(row["seconds"]) for row in read_rows(folder)]
+    assert seconds == sorted(seconds)
 
 
-def test_a_training_that_diverges_says_so_and_keeps_the_last_good_checkpoint(
-    whole, tmp_path, monkeypatch, capsys
-):
+def test_a_training_without_a_checkpoint_starts_anew(whole, start, go, tmp_path, capsys):
+    folder = tmp_path / "run"
+    with pytest.raises(SystemExit):
+        start(folder, compiled=stopping(whole[2][1], at=1))
+    assert checkpoints(folder) == []
+    assert len(read_rows(folder)) == 1
+    assert go("--resume", folder) == 0
+    assert "no checkpoint yet, starting at update 0" in capsys.readouterr().out
+    assert_same_result(folder, whole[0])
+
+
+def stopping(compiled, at):
+    """A training step that ends the process after some updates, as a kill would."""
+
+    def step(state):
+        if int(state.update) == at:
+            raise SystemExit
+        return compiled(state)
+
+    return step
+
+
+def test_a_finished_training_says_so(whole, go, capsys):
+    before = {path: path.read_bytes() for path in whole[0].iterdir() if path.is_file()}
+    assert go("--resume", whole[0]) == 0
+    assert "the training had finished, nothing is left to do" in capsys.readouterr().out
+    assert {path: path.read_bytes() for path in whole[0].iterdir() if path.is_file()} == before
+
+
+def test_a_training_that_was_stopped_in_its_evaluation_is_evaluated(whole, start, go, tmp_path, monkeypatch):
+    folder, called = tmp_path / "run", []
+    assert start(folder) == 0
+    monkeypatch.setattr(ppo, "finish", lambda state, env, run, console: called.append((state, run)))
+    assert go("--resume", folder) == 0
+    assert called == []
+    assert go("--resume", folder, "--evaluation-episodes", 3) == 0
+    ((state, run),) = called
+    assert int(state.update) == 3
+    assert run.evaluation_episodes == 3
+
+
+def test_a_stopped_evaluation_says_how_to_continue(start, go, tmp_path, monkeypatch, capsys):
+    def stopped(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(ppo, "finish", stopped)
+    folder = tmp_path / "run"
+    assert go(*SMALL, "--out", folder) == 130
+    assert capsys.readouterr().err == f"interrupted; continue with: python -m train.ppo --resume {folder}\n"
+
+
+def test_a_training_that_diverges_says_so_and_keeps_the_last_good_checkpoint(whole, start, tmp_path, capsys):
     _, compiled = whole[2]
 
     def diverging(state):
@@ -167,14 +264,14 @@ def test_a_training_that_diverges_says_so_and_keeps_the_last_good_checkpoint(
         return after, {**metrics, "value_loss": np.where(after.update == 3, np.nan, metrics["value_loss"])}
 
     folder = tmp_path / "run"
-    assert train_again(whole, folder, monkeypatch, compiled=diverging) == 1
+    assert start(folder, compiled=diverging) == 1
     said = " ".join(capsys.readouterr().out.split())
     assert "training diverged: value_loss is nan after update 3" in said
     assert "checkpoint of update 2 in" in said
     assert checkpoints(folder) == [2]
 
 
-def test_without_a_checkpoint_there_is_nothing_to_evaluate(whole, tmp_path, monkeypatch, capsys):
+def test_without_a_checkpoint_there_is_nothing_to_evaluate(whole, start, tmp_path, capsys):
     _, compiled = whole[2]
 
     def diverging(state):
@@ -182,7 +279,7 @@ def test_without_a_checkpoint_there_is_nothing_to_evaluate(whole, tmp_path, monk
         return after, {**metrics, "value_loss": np.float32(np.nan)}
 
     folder = tmp_path / "run"
-    assert train_again(whole, folder, monkeypatch, compiled=diverging) == 1
+    assert start(folder, compiled=diverging) == 1
     said = " ".join(capsys.readouterr().out.split())
     assert "stopped after 1 updates; no checkpoint yet in" in said
     assert "nothing to evaluate" in said
@@ -190,14 +287,9 @@ def test_without_a_checkpoint_there_is_nothing_to_evaluate(whole, tmp_path, monk
     assert checkpoints(folder) == []
 
 
-def test_the_same_seed_gives_the_same_numbers(whole, tmp_path, monkeypatch):
-    train_again(whole, tmp_path / "run", monkeypatch)
-    clock = ("seconds", "steps_per_second")
-    first, again = (
-        [[value for name, value in row.items() if name not in clock] for row in read_rows(folder)]
-        for folder in (whole[0], tmp_path / "run")
-    )
-    assert again == first
+def test_the_same_seed_gives_the_same_numbers(whole, start, tmp_path):
+    assert start(tmp_path / "run") == 0
+    assert_same_result(tmp_path / "run", whole[0])
 
 
 @pytest.mark.parametrize(
@@ -235,24 +327,3 @@ def test_an_existing_folder_is_left_alone(tmp_path, monkeypatch, capsys):
     assert stop.value.code == 2
     assert "expected a folder that does not exist yet" in capsys.readouterr().err
     assert [path.name for path in tmp_path.iterdir()] == ["kept"]
-
-
-@pytest.mark.slow
-def test_ctrl_c_in_a_shell_ends_with_code_130(tmp_path):
-    folder = tmp_path / "run"
-    options = [*SMALL, "--total-steps", "10000000", "--out", str(folder)]
-    process = subprocess.Popen(
-        [sys.executable, "-m", "train.ppo", *options], cwd=ROOT, stdout=subprocess.PIPE, text=True
-    )
-    deadline = time.monotonic() + 300
-    while not (folder / "metrics.csv").exists() or len(read_rows(folder)) < 3:
-        assert process.poll() is None
-        assert time.monotonic() < deadline
-        time.sleep(0.2)
-    process.send_signal(signal.SIGINT)
-    said, _ = process.communicate(timeout=60)
-    assert process.returncode == 130
-    rows = len(read_rows(folder))
-    assert checkpoints(folder)[-1] == rows
-    assert f"checkpoint of update {rows} in" in " ".join(said.split())
-    load_run(folder)

@@ -1,0 +1,120 @@
+"""The folder of a training: made for a new run, or opened to continue an interrupted one."""
+
+import contextlib
+import dataclasses
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+from train.checkpoint import Checkpoint, read_config, read_run, save, write_config, written_with
+from train.config import TrainConfig, check, first_difference, to_dict
+from train.learner import LearnerState
+from train.metrics_file import MetricsFile
+
+FREE = ("evaluation_episodes",)
+"""Options that a resumed training may change, because they change nothing that is learned or logged."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Run:
+    """A training and its folder.
+
+    Attributes:
+        folder: where it writes.
+        config: what it does, as in config.json.
+        evaluation_episodes: the configuration's, or what was asked for when it was resumed.
+        metrics: the open metrics.csv.
+        checkpoint: where it continues; None for the start.
+    """
+
+    folder: Path
+    config: TrainConfig
+    evaluation_episodes: int
+    metrics: MetricsFile
+    checkpoint: Checkpoint | None = None
+
+    @property
+    def resume_command(self) -> str:
+        """What continues it."""
+        return f"python -m train.ppo --resume {self.folder}"
+
+    @property
+    def trained(self) -> bool:
+        """All updates are done."""
+        return self.checkpoint is not None and self.checkpoint.update == self.config.num_updates
+
+    @property
+    def finished(self) -> bool:
+        """All updates are done, and what follows them too: results.json is its last file."""
+        evaluated = not self.evaluation_episodes or (self.folder / "results.json").exists()
+        return self.trained and evaluated
+
+    def save(self, state: LearnerState) -> None:
+        """Writes a checkpoint; what metrics.csv tells of the way to it is on the disk before."""
+        self.metrics.sync()
+        save(self.folder, state, self.config, self.metrics.digest)
+
+
+@contextlib.contextmanager
+def start_run(config: TrainConfig) -> Iterator[Run]:
+    """Makes the folder of a new run, which must not exist, and writes the configuration into it.
+
+    Raises:
+        ValueError: one line, if the configuration can not run.
+        OSError: if the folder can not be made.
+    """
+    check(config)
+    name = f"runs/{config.encoder}-seed{config.seed}-{time.strftime('%Y%m%d-%H%M%S')}"
+    folder = Path(config.out or name)
+    folder.mkdir(parents=True, exist_ok=False)
+    write_config(folder, config)
+    with MetricsFile(folder) as metrics:
+        yield Run(folder, config, config.evaluation_episodes, metrics)
+
+
+@contextlib.contextmanager
+def resume_run(folder: Path, evaluation_episodes: int) -> Iterator[Run]:
+    """Opens a run's folder at its newest intact checkpoint, or at the start if none was finished yet.
+
+    What is not as it was at the checkpoint is said. The metrics after it are cut off.
+
+    Raises:
+        ValueError: one line, if there is no such run, or nothing intact to continue from.
+        OSError: if the folder can not be written, or another training writes there.
+    """
+    read_config(folder)  # an empty folder stays empty
+    with MetricsFile(folder) as metrics:
+        config, checkpoint = read_run(folder)
+        if checkpoint is None:
+            if metrics.num_rows > config.checkpoint_every:
+                raise ValueError(f"resume = {str(folder)!r}: its checkpoints are gone, metrics.csv is not")
+            print(f"{folder}: no checkpoint yet, starting at update 0")
+            metrics.cut(0)
+        else:
+            say_changes(checkpoint)
+            metrics.cut(checkpoint.update, checkpoint.metrics_digest)
+            if metrics.lost:
+                print(f"{metrics.path}: begins after update {metrics.lost}, earlier rows are lost")
+        yield Run(folder, config, evaluation_episodes, metrics, checkpoint)
+
+
+def say_changes(checkpoint: Checkpoint) -> None:
+    """Says what is not as it was when the checkpoint was written."""
+    now = written_with()
+    for name in sorted({*now, *checkpoint.written_with}):
+        before, after = checkpoint.written_with.get(name), now.get(name)
+        if before != after:
+            print(
+                f"{name} was {before}, is {after}: results may differ from an uninterrupted run's in rounding"
+            )
+
+
+def require_unchanged(config: TrainConfig, wanted: TrainConfig) -> None:
+    """Raises ValueError, naming the option, if one that was given beside --resume would change the run."""
+    free = {name: getattr(wanted, name) for name in FREE}
+    if found := first_difference(to_dict(wanted), to_dict(dataclasses.replace(config, **free))):
+        name, given, own = found
+        raise ValueError(
+            f"{name} = {given!r}: expected {own!r} as in the run; beside --resume only "
+            f"{', '.join(FREE)} may change"
+        )
