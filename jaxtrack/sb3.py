@@ -1,6 +1,6 @@
 """`SearchTrack-v0` as a vectorised environment of Stable-Baselines3 (extra `sb3`)."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -9,7 +9,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from jaxtrack.gymnasium_env import action_space, observation_space, scenario_seeds
 from jaxtrack.host import Observation, Scenarios, Step
 
-Indices = int | Sequence[int] | None
+Indices = int | Iterable[int] | None
 Info = dict[str, Any]
 
 

@@ -1,5 +1,8 @@
 """Both environments in Stable-Baselines3: its own checker and vector environment; `make sb3` installs it."""
 
+import re
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -116,3 +119,22 @@ def test_without_a_seed_every_run_is_another(sb3):
     other.reset()
     looks = np.full((2, 2), 2)
     assert not np.array_equal(one.step(looks)[0]["tracks"], other.step(looks)[0]["tracks"])
+
+
+def test_the_block_of_the_documentation_trains(capsys):
+    page = Path(__file__).parents[1] / "jaxtrack/README.md"
+    (block,) = re.findall(r"```python sb3\n(.*?)```", page.read_text(), re.DOTALL)
+    exec(compile(block, str(page), "exec"), {"__name__": "__main__"})
+    assert "total_timesteps" in capsys.readouterr().out
+
+
+def test_the_example_trains_on_both_and_prints_a_table(capsys):
+    from examples.sb3_ppo import main
+
+    small = ["--steps", "32", "--num-envs", "4", "--rollout", "32", "--stone-soup-steps", "8"]
+    assert main([*small, "--max-steps-in-episode", "4"]) == 0
+    printed = capsys.readouterr().out
+    assert re.search(r"jaxtrack +│ 4 +│ 32 ", printed)
+    assert re.search(r"Stone Soup +│ 1 +│ 8 .*last 2 episodes", printed)
+    with pytest.raises(ValueError, match="rollout = 4: expected an integer >= 8"):
+        main(["--num-envs", "4", "--rollout", "4"])

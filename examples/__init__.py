@@ -1,0 +1,1 @@
+"""Short programs that use the environment from other people's libraries."""
