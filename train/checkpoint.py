@@ -19,11 +19,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxtrack.env import SearchTrack, make
+from jaxtrack.env import SearchTrack
 from jaxtrack.report import circumstances
-from train.config import TrainConfig, check, first_difference, from_dict, to_dict
+from train.config import TrainConfig, to_dict
 from train.learner import LearnerState, init_learner
-from train.sealed import check_seal, read_json, remove_sealed, seal_of, write_sealed, write_whole
+from train.sealed import check_seal, remove_sealed, seal_of, write_sealed
 
 KEPT = 2
 FORMAT = 1
@@ -105,9 +105,7 @@ def load_newest(folder: Path, say: Say = print) -> Checkpoint | None:
         say(f"{folder}: using the checkpoint of update {update}")
         return checkpoint
     if finished:
-        raise ValueError(
-            f"run = {str(folder)!r}: none of its checkpoints is intact: {', '.join(map(str, found))}"
-        )
+        raise ValueError(f"run = {str(folder)!r}: none of its checkpoints is intact (updates {found})")
     return None
 
 
@@ -163,59 +161,6 @@ def written_with() -> dict[str, Any]:
     devices = {"devices": jax.device_count(), "platform": platform.machine()}
     options = {"XLA_FLAGS": os.environ.get("XLA_FLAGS", "")}
     return {**about["versions"], **packages, **about["machine"], **devices, **options}
-
-
-def write_config(folder: Path, config: TrainConfig) -> None:
-    """Writes the run's configuration as config.json."""
-    write_whole(folder / "config.json", (json.dumps(to_dict(config), indent=2) + "\n").encode())
-
-
-def read_config(folder: Path) -> tuple[TrainConfig, dict[str, Any]]:
-    """A run's configuration, checked, and the same as it stands in config.json.
-
-    Raises:
-        ValueError: naming the folder or the file.
-    """
-    path = folder / "config.json"
-    try:
-        values = read_json(path)
-    except OSError:
-        raise ValueError(f"run = {str(folder)!r}: expected a folder with a config.json") from None
-    try:
-        config = from_dict(values)
-        check(dataclasses.replace(config, out=""))
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from None
-    return config, values
-
-
-def read_run(folder: Path, say: Say = print) -> tuple[TrainConfig, Checkpoint | None]:
-    """Configuration and newest intact checkpoint of a run, which must agree.
-
-    Raises:
-        ValueError: naming the folder or the file, if it holds no readable run.
-    """
-    config, values = read_config(folder)
-    checkpoint = load_newest(folder, say)
-    if checkpoint is not None and (found := first_difference(values, checkpoint.config)):
-        name, here, there = found
-        raise ValueError(
-            f"{folder / 'config.json'}: {name} = {here!r}, but the checkpoint was trained with {there!r}"
-        )
-    return config, checkpoint
-
-
-def load_run(folder: Path, say: Say = print) -> tuple[TrainConfig, SearchTrack, Any]:
-    """Configuration, environment and latest weights of a run.
-
-    Raises:
-        ValueError: naming the folder, if it holds no readable run.
-    """
-    config, checkpoint = read_run(folder, say)
-    env, _ = make(config.params, config.static)
-    if checkpoint is None:
-        raise ValueError(f"run = {str(folder)!r}: holds no checkpoint")
-    return config, env, restore(checkpoint, learner_shapes(env, config)).weights
 
 
 def _path(folder: Path, update: int) -> Path:

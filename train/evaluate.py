@@ -25,10 +25,10 @@ from jaxtrack.managers import MANAGERS
 from jaxtrack.params import Params, StaticParams
 from jaxtrack.policies import POLICIES
 from train.agents import agent_policy
-from train.checkpoint import load_run
 from train.config import TrainConfig, to_dict
 from train.episodes import Comparison, Competitor, compare, rule
 from train.results import Summary, print_results, summarise, write_results
+from train.saved_run import load_run
 from train.scenarios import build_scenario
 
 COMPARED_SEED = 1_000_000

@@ -40,10 +40,12 @@ class MetricsFile:
             reason = "another training is writing into this folder" if busy else error.strerror
             raise OSError(error.errno, reason, str(self.path)) from None
         self._file.seek(0)
-        whole_lines = self._file.read().split("\n")[:-1]
+        text = self._file.read()
+        whole_lines = text.split("\n")[:-1]
         self._columns = _cells(whole_lines[0]) if whole_lines else []
         self._rows = [_cells(line) for line in whole_lines[1:]]
         self._ends = [len(line) + 1 for line in whole_lines]
+        self._empty = not text
         self._digest = hashlib.sha256()
         self.lost, self.num_rows, self.seconds = 0, len(self._rows), 0.0
 
@@ -60,16 +62,16 @@ class MetricsFile:
                 raise
 
     def cut(self, update: int, digest: str = "") -> None:
-        """Keeps the rows up to that of `update`, whose `digest` the checkpoint holds; all go for update 0.
+        """Keeps the rows up to that of `update`, whose `digest` the checkpoint holds; none for update 0.
 
-        A file that was removed begins anew, with `lost` updates before its first row.
+        A file that was removed or is empty begins anew, with `lost` updates before its first row.
 
         Raises:
             ValueError: if one of the rows is missing or was changed.
         """
         self.lost = update
         kept = []
-        if update and self._rows:
+        if update and not self._empty:
             kept = self._read_rows(update)
             if not kept or self.digest != digest:
                 raise ValueError(

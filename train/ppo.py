@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+import shlex
 import sys
 import time
 from collections.abc import Sequence
@@ -16,7 +17,7 @@ from rich.progress import Progress
 from jaxtrack.cli import INTERRUPTED, parse, run, take_config, wide_console
 from jaxtrack.env import SearchTrack, make
 from train import learner
-from train.checkpoint import learner_shapes, read_config, restore
+from train.checkpoint import learner_shapes
 from train.config import TrainConfig, from_dict
 from train.display import columns, note, print_config, say_now_and_then
 from train.evaluate import COMPARED_SEED, agent, compare_with_baselines
@@ -24,6 +25,7 @@ from train.interrupt import Interrupt, exit_code
 from train.learner import LearnerState
 from train.results import print_results, summarise, write_results
 from train.run_folder import Run, require_unchanged, resume_run, start_run
+from train.saved_run import read_config
 
 FAILED = 1
 LOST = "training diverged: {name} is {value} after update {update}"
@@ -88,14 +90,14 @@ def _config(options: Options) -> TrainConfig:
 
 def execute(run: Run, console: Console) -> int:
     """Trains, as far as that was not done before, and evaluates; returns the exit code."""
-    print_config(run.config, run.folder, console)
-    env, _ = make(run.config.params, run.config.static)
     code = 0
-    if run.trained:
-        console.print("the training had finished, what follows it had not")
-        state = first_state(run, env)
-    else:
-        with Interrupt(f"continue with: {run.resume_command}") as interrupt:
+    with Interrupt(f"continue with: {run.resume_command}") as interrupt:
+        print_config(run.config, run.folder, console)
+        env, _ = make(run.config.params, run.config.static)
+        if run.trained:
+            console.print("the training had finished, what follows it had not")
+            state = first_state(run, env)
+        else:
             state, compiled = compile_training(run, env, console)
             state, code = train(state, compiled, run, interrupt, console)
     if code == 0 and run.evaluation_episodes:
@@ -105,8 +107,8 @@ def execute(run: Run, console: Console) -> int:
 
 def first_state(run: Run, env: SearchTrack) -> LearnerState:
     """The learner state of the run's checkpoint, or a fresh one."""
-    if run.checkpoint is not None:
-        return restore(run.checkpoint, learner_shapes(env, run.config))
+    if run.state is not None:
+        return run.state
     init = jax.jit(lambda key, params: learner.init_learner(key, params, env, run.config))
     return init(jax.random.key(run.config.seed), run.config.params)
 
@@ -127,12 +129,12 @@ def train(
     state: LearnerState, compiled: Any, run: Run, interrupt: Interrupt, console: Console
 ) -> tuple[LearnerState, int]:
     """Runs the updates that are left; one row of metrics each, a checkpoint now and then and at the end."""
-    config, done = run.config, int(state.update)
-    saved, code = done if run.checkpoint else None, 0
+    config, code = run.config, 0
+    saved = run.done or None
     started = time.perf_counter() - run.metrics.seconds
     with Progress(*columns(), console=console, disable=not console.is_terminal) as progress:
         task = progress.add_task("training", total=config.num_updates * config.batch_size, note="")
-        for update in range(done + 1, config.num_updates + 1):
+        for update in range(run.done + 1, config.num_updates + 1):
             state, metrics = compiled(state)
             row = make_row(jax.device_get(metrics), update, time.perf_counter() - started, run)
             lost = next((name for name in HEALTH if not math.isfinite(row[name])), None)
@@ -150,21 +152,19 @@ def train(
                 code = exit_code(interrupt.signal)
                 break
     if code:
-        say_stopped(update, saved, run, code, console)
+        say_stopped(update, saved, run, code)
     return state, code
 
 
-def say_stopped(update: int, saved: int | None, run: Run, code: int, console: Console) -> None:
-    """Says what is left of a training that did not reach its end."""
+def say_stopped(update: int, saved: int | None, run: Run, code: int) -> None:
+    """Says what is left of a training that did not reach its end; not wrapped, so that it can be copied."""
     if saved is None:
-        console.print(
-            f"stopped after {update} updates; no checkpoint yet in {run.folder}, so nothing to evaluate"
-        )
+        print(f"stopped after {update} updates; no checkpoint yet in {run.folder}, so nothing to evaluate")
         return
-    console.print(f"stopped after {update} updates; checkpoint of update {saved} in {run.folder}")
+    print(f"stopped after {update} updates; checkpoint of update {saved} in {run.folder}")
     if code != FAILED:
-        console.print(f"continue with: {run.resume_command}")
-    console.print(f"evaluate it with: python -m train.evaluate --run {run.folder}")
+        print(f"continue with: {run.resume_command}")
+    print(f"evaluate it with: python -m train.evaluate --run {shlex.quote(str(run.folder))}")
 
 
 HEALTH = ("policy_loss", "value_loss", "gradient_norm", "reward")

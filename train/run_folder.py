@@ -2,14 +2,16 @@
 
 import contextlib
 import dataclasses
+import shlex
 import time
 from collections.abc import Iterator
 from pathlib import Path
 
-from train.checkpoint import Checkpoint, read_config, read_run, save, write_config, written_with
+from train.checkpoint import Checkpoint, save, written_with
 from train.config import TrainConfig, check, first_difference, to_dict
 from train.learner import LearnerState
 from train.metrics_file import MetricsFile
+from train.saved_run import read_config, read_run, write_config
 
 FREE = ("evaluation_episodes",)
 """Options that a resumed training may change, because they change nothing that is learned or logged."""
@@ -24,24 +26,26 @@ class Run:
         config: what it does, as in config.json.
         evaluation_episodes: the configuration's, or what was asked for when it was resumed.
         metrics: the open metrics.csv.
-        checkpoint: where it continues; None for the start.
+        done: updates that its checkpoint has behind it.
+        state: the learner state of the checkpoint; None at the start.
     """
 
     folder: Path
     config: TrainConfig
     evaluation_episodes: int
     metrics: MetricsFile
-    checkpoint: Checkpoint | None = None
+    done: int = 0
+    state: LearnerState | None = None
 
     @property
     def resume_command(self) -> str:
         """What continues it."""
-        return f"python -m train.ppo --resume {self.folder}"
+        return f"python -m train.ppo --resume {shlex.quote(str(self.folder))}"
 
     @property
     def trained(self) -> bool:
         """All updates are done."""
-        return self.checkpoint is not None and self.checkpoint.update == self.config.num_updates
+        return self.done == self.config.num_updates
 
     @property
     def finished(self) -> bool:
@@ -84,18 +88,20 @@ def resume_run(folder: Path, evaluation_episodes: int) -> Iterator[Run]:
     """
     read_config(folder)  # an empty folder stays empty
     with MetricsFile(folder) as metrics:
-        config, checkpoint = read_run(folder)
-        if checkpoint is None:
-            if metrics.num_rows > config.checkpoint_every:
-                raise ValueError(f"resume = {str(folder)!r}: its checkpoints are gone, metrics.csv is not")
-            print(f"{folder}: no checkpoint yet, starting at update 0")
-            metrics.cut(0)
-        else:
-            say_changes(checkpoint)
-            metrics.cut(checkpoint.update, checkpoint.metrics_digest)
+        saved = read_run(folder)
+        done = 0
+        if saved.checkpoint is not None:
+            done = saved.checkpoint.update
+            say_changes(saved.checkpoint)
+            metrics.cut(done, saved.checkpoint.metrics_digest)
             if metrics.lost:
                 print(f"{metrics.path}: begins after update {metrics.lost}, earlier rows are lost")
-        yield Run(folder, config, evaluation_episodes, metrics, checkpoint)
+        elif metrics.num_rows > saved.config.checkpoint_every:
+            raise ValueError(f"resume = {str(folder)!r}: its checkpoints are gone, metrics.csv is not")
+        else:
+            print(f"{folder}: no checkpoint yet, starting at update 0")
+            metrics.cut(0)
+        yield Run(folder, saved.config, evaluation_episodes, metrics, done, saved.state)
 
 
 def say_changes(checkpoint: Checkpoint) -> None:
@@ -104,9 +110,7 @@ def say_changes(checkpoint: Checkpoint) -> None:
     for name in sorted({*now, *checkpoint.written_with}):
         before, after = checkpoint.written_with.get(name), now.get(name)
         if before != after:
-            print(
-                f"{name} was {before}, is {after}: results may differ from an uninterrupted run's in rounding"
-            )
+            print(f"{name} was {before}, is {after}: results may differ in rounding from now on")
 
 
 def require_unchanged(config: TrainConfig, wanted: TrainConfig) -> None:

@@ -28,9 +28,8 @@ def write_whole(path: Path, data: bytes) -> None:
         os.replace(part, path)
         _sync_folder(path.parent)
     except OSError as error:
-        error.filename, error.filename2 = str(path), None
         _remove(part)
-        raise
+        raise OSError(error.errno, error.strerror, str(path)) from None
 
 
 def write_sealed(path: Path, data: bytes) -> None:

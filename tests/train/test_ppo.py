@@ -13,10 +13,11 @@ from jaxtrack import StaticParams
 from jaxtrack.cli import run
 from jaxtrack.policies import POLICIES
 from train import evaluate, ppo
-from train.checkpoint import load_newest, load_run, updates
+from train.checkpoint import load_newest, updates
 from train.episode_metrics import METRICS
 from train.figures import FIGURES
 from train.metrics_file import CLOCK, MetricsFile
+from train.saved_run import load_run
 
 pytestmark = pytest.mark.usefixtures("quick_compilation")
 
@@ -122,7 +123,7 @@ def go(whole, monkeypatch):
 
     def command(*arguments, compiled=whole[2][1]):
         def compile_nothing(run, env, console):
-            state = ppo.first_state(run, env) if run.checkpoint else jax.device_put(whole[2][0])
+            state = run.state or jax.device_put(whole[2][0])
             return state, compiled
 
         with monkeypatch.context() as patch:

@@ -1,0 +1,84 @@
+"""A run's folder as it is read: its configuration, its newest intact checkpoint, and whether they agree."""
+
+import dataclasses
+import json
+from pathlib import Path
+from typing import Any
+
+from jaxtrack.env import SearchTrack, make
+from train.checkpoint import Checkpoint, Say, learner_shapes, load_newest, restore
+from train.config import TrainConfig, check, first_difference, from_dict, to_dict
+from train.learner import LearnerState
+from train.sealed import read_json, write_whole
+
+
+@dataclasses.dataclass(frozen=True)
+class SavedRun:
+    """What a folder holds.
+
+    Attributes:
+        config: the run's configuration.
+        env: its environment.
+        checkpoint: the newest that is intact; None if none was ever finished.
+        state: the learner state in it.
+    """
+
+    config: TrainConfig
+    env: SearchTrack
+    checkpoint: Checkpoint | None = None
+    state: LearnerState | None = None
+
+
+def write_config(folder: Path, config: TrainConfig) -> None:
+    """Writes the run's configuration as config.json."""
+    write_whole(folder / "config.json", (json.dumps(to_dict(config), indent=2) + "\n").encode())
+
+
+def read_config(folder: Path) -> tuple[TrainConfig, dict[str, Any]]:
+    """A run's configuration, checked, and the same as it stands in config.json.
+
+    Raises:
+        ValueError: naming the folder or the file.
+    """
+    path = folder / "config.json"
+    try:
+        values = read_json(path)
+    except OSError:
+        raise ValueError(f"run = {str(folder)!r}: expected a folder with a config.json") from None
+    try:
+        config = from_dict(values)
+        check(dataclasses.replace(config, out=""))
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from None
+    return config, values
+
+
+def read_run(folder: Path, say: Say = print) -> SavedRun:
+    """Reads a run, of which checkpoint, configuration and this program must agree; what is damaged is said.
+
+    Raises:
+        ValueError: naming the folder or the file, if that is not possible.
+    """
+    config, values = read_config(folder)
+    env, _ = make(config.params, config.static)
+    checkpoint = load_newest(folder, say)
+    if checkpoint is None:
+        return SavedRun(config, env)
+    if found := first_difference(values, checkpoint.config):
+        name, here, there = found
+        raise ValueError(
+            f"{folder / 'config.json'}: {name} = {here!r}, but the checkpoint was trained with {there!r}"
+        )
+    return SavedRun(config, env, checkpoint, restore(checkpoint, learner_shapes(env, config)))
+
+
+def load_run(folder: Path, say: Say = print) -> tuple[TrainConfig, SearchTrack, Any]:
+    """Configuration, environment and latest weights of a run.
+
+    Raises:
+        ValueError: naming the folder or the file, if it holds no readable run.
+    """
+    run = read_run(folder, say)
+    if run.state is None:
+        raise ValueError(f"run = {str(folder)!r}: holds no checkpoint")
+    return run.config, run.env, run.state.weights
