@@ -200,4 +200,6 @@ def _select(chosen: jax.Array, new: Any, old: Any) -> Any:
 
 def _to_host(tree: Any) -> Any:
     """All arrays in one transfer, and as copies: they may be written to."""
-    return jax.tree.map(np.copy, jax.device_get(tree))
+    if jax.default_backend() != "cpu":  # a CPU's arrays are there already
+        tree = jax.device_get(tree)
+    return jax.tree.map(np.array, tree)
