@@ -30,7 +30,15 @@ def random_state():
     """A learner whose arrays all hold different random numbers, without compiling its start."""
     shapes = learner_shapes(SearchTrack(STATIC), CONFIG)
     rng = np.random.default_rng(0)
-    return jax.tree.map(lambda leaf: jnp.asarray(rng.normal(size=leaf.shape) * 9).astype(leaf.dtype), shapes)
+
+    def draw(leaf):
+        if leaf.dtype == bool:
+            return jnp.asarray(rng.integers(2, size=leaf.shape), bool)
+        if jnp.issubdtype(leaf.dtype, jnp.integer):
+            return jnp.asarray(rng.integers(1, 1 << 20, leaf.shape), leaf.dtype)
+        return jnp.asarray(9 * rng.normal(size=leaf.shape), leaf.dtype)
+
+    return jax.tree.map(draw, shapes)
 
 
 def at(state, update):
