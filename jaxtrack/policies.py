@@ -19,7 +19,7 @@ import jax.numpy as jnp
 from jaxtrack.models import elevation_bearing_range
 from jaxtrack.observation import variances
 from jaxtrack.params import Params, StaticParams
-from jaxtrack.scan_map import beam_means, look_grid
+from jaxtrack.scan_map import beam_means, beam_sizes, look_grid
 from jaxtrack.sensor import in_beams, look_number
 from jaxtrack.types import Tracks, position
 
@@ -139,6 +139,49 @@ def index(
     return policy
 
 
+def gain(
+    static: StaticParams,
+    params: Params,
+    *,
+    sharpness: int = 16,
+    area_exponent: float = 0.5,
+    variance_scale: float = 1000.0,
+    danger_weight: float = 3.0,
+    danger_exponent: int = 8,
+) -> Policy:
+    """The look with the largest gain.
+
+    The gain of a look is the field it finds unseen, plus, summed over the tracks in its beam, the
+    position variance P that a detection with noise of variance R would remove, ``P - P R / (P + R)``,
+    and the danger that the track is deleted soon, a high power of trace / deletion threshold.
+
+    Args:
+        static: shapes.
+        params: numbers.
+        sharpness: power of every scan value; a high one counts only what was never seen, or long ago.
+        area_exponent: power of the beam's size in the field, per median of all looks; 1 counts the
+            area that is found unseen, 0 its share of the beam. Beams hold more far from the horizon.
+        variance_scale: removed variance that is worth as much as a beam of field never seen (m^2).
+        danger_weight: worth of a track that is about to be deleted.
+        danger_exponent: power of trace / deletion threshold.
+    """
+    looks, sizes = look_grid(static, params), beam_sizes(static, params)
+    areas = (sizes / jnp.median(sizes)) ** area_exponent
+    scan_values = beam_means(static, params)
+
+    def policy(key: jax.Array, state: "EnvState") -> jax.Array:
+        del key
+        tracks = state.tracks
+        distance = jnp.linalg.norm(position(tracks.mean), axis=-1)
+        removed = removed_variance(variances(tracks)[:, 0], distance, params)
+        danger = trace_share(tracks, params) ** danger_exponent
+        need = removed / variance_scale + danger_weight * danger
+        unseen = areas * scan_values(state.scan_map**sharpness)
+        return to_action(jnp.argmax(unseen + sum_in_beams(need, tracks, looks, params)), static, params)
+
+    return policy
+
+
 POLICIES: dict[str, PolicyBuilder] = {
     "random": random,
     "static": static,
@@ -153,6 +196,7 @@ POLICIES: dict[str, PolicyBuilder] = {
         sharpness=TUNED_SHARPNESS,
         position_weight=TUNED_POSITION_WEIGHT,
     ),
+    "gain": gain,
 }
 
 
@@ -174,6 +218,21 @@ def trace_share(tracks: Tracks, params: Params, position_weight: float | jax.Arr
     of_position, of_velocity = jnp.moveaxis(variances(tracks), -1, 0)
     trace = position_weight * of_position + of_velocity
     return jnp.where(tracks.active, trace / params.deletion_threshold, 0.0)
+
+
+def removed_variance(of_position: jax.Array, distance: jax.Array, params: Params) -> jax.Array:
+    """Position variance (m^2) that one more detection would remove: ``P^2 / (P + R)``.
+
+    Sums over the three axes stand for P, the track's variance, and for R, that of a detection.
+
+    Args:
+        of_position: P of each track, the sum over the axes (m^2).
+        distance: of each track from the radar (m).
+        params: numbers; the noise of the radar.
+    """
+    across = params.elevation_sigma**2 + params.bearing_sigma**2
+    noise = distance**2 * across + params.range_sigma**2
+    return of_position**2 / (of_position + noise)
 
 
 def sum_in_beams(values: jax.Array, tracks: Tracks, looks: jax.Array, params: Params) -> jax.Array:

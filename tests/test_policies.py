@@ -10,7 +10,7 @@ import pytest
 from jaxtrack import Params, StaticParams, Tracks, Truths
 from jaxtrack.env import SearchTrack
 from jaxtrack.episode import EnvState
-from jaxtrack.policies import POLICIES, REVISIT_SHARE, index, scheduler
+from jaxtrack.policies import POLICIES, REVISIT_SHARE, gain, index, scheduler
 from jaxtrack.sensor import look_angles
 
 pytestmark = pytest.mark.usefixtures("quick_compilation")
@@ -194,6 +194,58 @@ def test_index_with_other_numbers(exponent, scan_weight, sharpness, position_wei
         assert action == largest(scan_weight * scan**sharpness + share)
         moved += action != act("index", state)
     assert moved > 0, "in these scenes the numbers matter"
+
+
+def by_gain(
+    state, sharpness=16, area_exponent=0.5, variance_scale=1000.0, danger_weight=3.0, danger_exponent=8
+):
+    """Field found unseen, and what the tracks need: `[L, L]` each, in numpy."""
+    angles = np.linspace(-LIMIT, LIMIT, M)
+    pixels = unit(*np.meshgrid(angles, angles)).reshape(-1, 3)
+    values = np.asarray(state.scan_map, dtype=np.float64).ravel() ** sharpness
+    places = np.asarray(state.tracks.mean, dtype=np.float64)[:, 0::2]
+    of_state = np.diagonal(np.asarray(state.tracks.covariance, dtype=np.float64), axis1=1, axis2=2)
+    before = of_state[:, 0::2].sum(axis=1)
+    across = PARAMS.elevation_sigma**2 + PARAMS.bearing_sigma**2
+    noise = np.linalg.norm(places, axis=1) ** 2 * across + PARAMS.range_sigma**2
+    danger = (of_state.sum(axis=1) / PARAMS.deletion_threshold) ** danger_exponent
+    needs = (before - 1 / (1 / before + 1 / noise)) / variance_scale + danger_weight * danger
+    active = np.asarray(state.tracks.active)
+    unseen, sizes, need = np.zeros((3, L, L))
+    for i, azimuth in enumerate(np.linspace(-LIMIT, LIMIT, L)):
+        for j, elevation in enumerate(np.linspace(-LIMIT, LIMIT, L)):
+            held = inside(pixels, azimuth, elevation)
+            unseen[i, j], sizes[i, j] = values[held].mean(), held.sum()
+            need[i, j] = needs[active & inside(places, azimuth, elevation)].sum()
+    return unseen * (sizes / np.median(sizes)) ** area_exponent, need
+
+
+@pytest.mark.parametrize(
+    "numbers",
+    [
+        {},
+        {"sharpness": 2},
+        {"area_exponent": 1.5},
+        {"variance_scale": 1e3},
+        {"danger_weight": 3.0},
+        {"danger_exponent": 2},
+    ],
+    ids=str,
+)
+def test_gain_takes_the_look_that_finds_most_field_unseen_and_helps_the_tracks_most(numbers):
+    # These tracks are worse than usual: by default they would outweigh any search.
+    patient = {"variance_scale": 5e4, "danger_weight": 0.1}
+    numbers = {**patient, **numbers}
+    policy = jax.jit(functools.partial(gain, **numbers)(STATIC, PARAMS))
+    gains = [(by_gain(scene(seed), **numbers), by_gain(scene(seed), **patient)) for seed in range(8)]
+    chosen = [policy(jax.random.key(0), scene(seed)).tolist() for seed in range(8)]
+    assert chosen == [largest(unseen + need) for (unseen, need), _ in gains]
+    if numbers == patient:
+        # In these scenes either part alone would choose differently.
+        assert any(look != largest(unseen) for look, ((unseen, _), _) in zip(chosen, gains, strict=True))
+        assert any(need[tuple(look)] < need.max() for look, ((_, need), _) in zip(chosen, gains, strict=True))
+    else:
+        assert chosen != [largest(unseen + need) for _, (unseen, need) in gains]
 
 
 def with_share(share, azimuth, elevation):

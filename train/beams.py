@@ -14,6 +14,7 @@ from flax import struct
 from jaxtrack.models import direction
 from jaxtrack.observation import Observation
 from jaxtrack.params import Params, StaticParams
+from jaxtrack.policies import removed_variance
 from jaxtrack.scan_map import beam_means, beam_sizes, look_grid
 from jaxtrack.sensor import in_beams, look_number
 
@@ -24,27 +25,34 @@ be able to tell them apart by several nats, or the policy stays almost uniform."
 NEVER_SEEN = 0.9999
 """Scan value above which a pixel counts as never looked at."""
 
-SHARPNESS = 4
-"""Power of the scan value that tells what was never seen from what was seen long ago."""
+SHARPNESS = 16
+"""Power of every scan value that tells what was never seen from what was seen long ago."""
+
+DANGER_EXPONENT = 8
+"""Power of trace / deletion threshold that tells the tracks that are about to be deleted."""
+
+REMOVED_SCALE = 0.1
+"""Removed variance, per deletion threshold, that counts as 1."""
 
 
 class BeamInputs(struct.PyTreeNode):
     """What the beam network reads, K = L * L looks.
 
     Attributes:
-        search: `[..., 7, K]` of every look: mean scan value s in its beam; s to the power of
-            `SHARPNESS`; s times the pixels in the beam, per largest number of them; mean n of s over
-            the eight looks around it, 0 outside the field; s times n; its azimuth and elevation, per
-            limit of the field.
+        search: `[..., 8, K]` of every look: mean scan value s in its beam; mean u of the scan values
+            to the power of `SHARPNESS`; u times the root of a, and u times a, the pixels in the beam
+            per largest number of them; mean n of u over the eight looks around it, 0 outside the
+            field; u times n; its azimuth and elevation, per limit of the field.
         inside: `[..., T, K]` whether a track lies in the beam of a look.
         tracks: `[..., T, F]` the observation's features, the root of the covariance norm, s of the
-            look nearest to the track, and where they are observed the variances and their roots.
+            look nearest to the track, and where variances are observed: them and their roots, the
+            variance that a detection would remove and its root, and the danger of deletion.
         mask: `[..., T]` where there is a track.
         context: `[..., 6]` share of slots in use; mean scan value; share of the field never seen;
             mean, mean root and maximum of the covariance norms.
     """
 
-    search: jax.Array  # [..., 7, K]
+    search: jax.Array  # [..., 8, K]
     inside: jax.Array  # [..., T, K] bool
     tracks: jax.Array  # [..., T, F]
     mask: jax.Array  # [..., T] bool
@@ -68,25 +76,32 @@ class BeamGeometry:
         tracks = jnp.where(mask[:, None], observation["tracks"], 0.0)
         angles, norm = tracks[:, 1:3] * self.params.field_limit, tracks[:, 6]
         towards = direction(angles[:, 0], angles[:, 1])
-        scan_value = self.scan_values(scan_map)
+        scan_value, unseen = jax.vmap(self.scan_values)(jnp.stack([scan_map, scan_map**SHARPNESS]))
         nearest = jax.vmap(look_number, in_axes=(0, None, None))(angles, self.static, self.params)
         own = [tracks, jnp.sqrt(norm)[:, None], jnp.where(mask, scan_value[nearest], 0.0)[:, None]]
         if "variances" in observation:
             variances = jnp.where(mask[:, None], observation["variances"], 0.0)
-            own += [variances, jnp.sqrt(variances)]
+            own += [variances, jnp.sqrt(variances), self._needs(tracks[:, 0], variances)]
         return BeamInputs(
-            search=self._search(scan_value),
+            search=self._search(scan_value, unseen),
             inside=in_beams(towards, self.looks, self.params) & mask[:, None],
             tracks=jnp.concatenate(own, axis=-1),
             mask=mask,
             context=self._context(norm, mask, scan_map),
         )
 
-    def _search(self, scan_value: jax.Array) -> jax.Array:
-        around = mean_of_neighbours(scan_value.reshape(self.static.num_looks, -1)).ravel()
+    def _needs(self, distance: jax.Array, variances: jax.Array) -> jax.Array:
+        threshold = self.params.deletion_threshold
+        removed = removed_variance(variances[:, 0] * threshold, distance * self.params.max_range, self.params)
+        removed /= REMOVED_SCALE * threshold
+        danger = variances.sum(axis=-1) ** DANGER_EXPONENT
+        return jnp.stack([removed, jnp.sqrt(removed), danger], axis=-1)
+
+    def _search(self, scan_value: jax.Array, unseen: jax.Array) -> jax.Array:
+        around = mean_of_neighbours(unseen.reshape(self.static.num_looks, -1)).ravel()
         places = self.looks.T / self.params.field_limit
-        own = [scan_value, scan_value**SHARPNESS, scan_value * self.areas]
-        return jnp.stack([*own, around, scan_value * around, *places])
+        own = [scan_value, unseen, unseen * jnp.sqrt(self.areas), unseen * self.areas]
+        return jnp.stack([*own, around, unseen * around, *places])
 
     def _context(self, norm: jax.Array, mask: jax.Array, scan_map: jax.Array) -> jax.Array:
         number = jnp.maximum(mask.sum(), 1)

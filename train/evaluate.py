@@ -46,7 +46,8 @@ class EvaluateOptions:
     """Compares policies on the same scenarios: baselines, planners, and trained runs."""
 
     policies: tuple[str, ...] = (ALL,)
-    """Names of baselines: random, static, coverage, stalest, scheduler, index, index_tuned, or "all";
+    """Names of baselines: random, static, coverage, stalest, scheduler, index, index_tuned, gain,
+    or "all";
     and of planners: greedy, rollout, uncertainty, or "planners". No name after the option for none."""
     runs: Annotated[tuple[Path, ...], tyro.conf.arg(aliases=["--run"])] = ()
     """Folders of trained runs; runs that differ in nothing but their seed are one policy."""

@@ -67,9 +67,16 @@ class Transition(struct.PyTreeNode):
 
 
 def make_optimiser(config: TrainConfig) -> optax.GradientTransformation:
-    """Adam on gradients clipped by their global norm, with the learning rate annealed to zero."""
-    steps = config.num_updates * config.epochs * config.num_minibatches
-    rate = optax.linear_schedule(config.learning_rate, 0.0, steps) if config.anneal else config.learning_rate
+    """Adam on gradients clipped by their global norm.
+
+    The rate of the warm start is constant, the one after it annealed to zero.
+    """
+    per_update = config.epochs * config.num_minibatches
+    warm = config.warm_start_updates * per_update
+    end = 0.0 if config.anneal else config.learning_rate
+    left = max(1, config.num_updates * per_update - warm)
+    rewarded = optax.linear_schedule(config.learning_rate, end, left)
+    rate = optax.join_schedules([lambda _: config.warm_start_learning_rate, rewarded], [warm])
     return optax.chain(optax.clip_by_global_norm(config.max_grad_norm), optax.adam(rate, eps=1e-5))
 
 

@@ -64,25 +64,30 @@ def test_observed_variances_and_their_roots_are_features(features):
     wider = jax.jit(BeamGeometry(STATIC, PARAMS))({**observation, "variances": variances})
     np.testing.assert_array_equal(wider.tracks[:, :9], features(observation).tracks)
     np.testing.assert_allclose(
-        wider.tracks[:2, 9:], [[0.04, 0.09, 0.2, 0.3], [0.16, 0.25, 0.4, 0.5]], rtol=1e-5
+        wider.tracks[:2, 9:13], [[0.04, 0.09, 0.2, 0.3], [0.16, 0.25, 0.4, 0.5]], rtol=1e-5
     )
+    # At 5 km a detection has a variance of 225 m^2: 2 (5000 m x 2 mrad)^2 + (5 m)^2; the tracks 200 and 800.
+    removed = np.array([200**2 / (200 + 225), 800**2 / (800 + 225)]) / 500
+    danger = np.array([0.13, 0.41]) ** 8
+    np.testing.assert_allclose(wider.tracks[:2, 13:].T, [removed, np.sqrt(removed), danger], rtol=1e-4)
     assert not wider.tracks[2:].any()
 
 
 def test_what_a_beam_would_search(features):
     inputs = features(observe())
-    scan, sharp, whole, around, product, azimuth, elevation = np.asarray(inputs.search)
+    scan, unseen, by_root, by_area, around, product, azimuth, elevation = np.asarray(inputs.search)
     scan_map = np.asarray(observe()["scan_map"])
     # The look straight ahead holds the middle pixel and its eight neighbours.
     np.testing.assert_allclose(scan[CENTRE], scan_map[3:6, 3:6].mean(), rtol=1e-5)
-    np.testing.assert_allclose(sharp, scan**4, rtol=1e-5)
-    np.testing.assert_allclose(product, scan * around, rtol=1e-5)
+    np.testing.assert_allclose(unseen[CENTRE], (scan_map[3:6, 3:6] ** 16).mean(), rtol=1e-5)
+    np.testing.assert_allclose(product, unseen * around, rtol=1e-5)
     # It holds nine pixels.
     pixels = np.asarray(beam_weights(STATIC, PARAMS) > 0).sum(axis=1)
     assert pixels[CENTRE] == 9
-    np.testing.assert_allclose(whole, scan * pixels / pixels.max(), rtol=1e-5)
+    np.testing.assert_allclose(by_area, unseen * pixels / pixels.max(), rtol=1e-5)
+    np.testing.assert_allclose(by_root, unseen * np.sqrt(pixels / pixels.max()), rtol=1e-5)
     neighbours = [CENTRE + a * L + e for a in (-1, 0, 1) for e in (-1, 0, 1) if (a, e) != (0, 0)]
-    np.testing.assert_allclose(around[CENTRE], scan[neighbours].mean(), rtol=1e-5)
+    np.testing.assert_allclose(around[CENTRE], unseen[neighbours].mean(), rtol=1e-5)
     np.testing.assert_allclose(azimuth.reshape(L, L)[:, 0], [-1, -0.5, 0, 0.5, 1], atol=1e-6)
     np.testing.assert_allclose(elevation.reshape(L, L)[0], [-1, -0.5, 0, 0.5, 1], atol=1e-6)
 
@@ -112,7 +117,7 @@ def drawn(draw_variables):
     rng = np.random.default_rng(0)
     mask = np.broadcast_to(np.arange(T) < 3, (3, T))
     inputs = BeamInputs(
-        search=jnp.asarray(rng.uniform(0, 1, (3, 7, L * L)), dtype=float),
+        search=jnp.asarray(rng.uniform(0, 1, (3, 8, L * L)), dtype=float),
         inside=jnp.asarray((rng.uniform(0, 1, (3, T, L * L)) < 0.3) & mask[..., None]),
         tracks=jnp.asarray(rng.uniform(0, 1, (3, T, 9)) * mask[..., None], dtype=float),
         mask=jnp.asarray(mask),

@@ -57,7 +57,7 @@ def test_shares_lie_in_the_unit_interval(name):
         check(TrainConfig(**{**SMALL, name: value}))
 
 
-@pytest.mark.parametrize("name", ["learning_rate", "clip", "max_grad_norm", "reward_scale"])
+@pytest.mark.parametrize("name", ["learning_rate", "warm_start_learning_rate", "clip", "reward_scale"])
 def test_scales_are_positive(name):
     for value in (0.0, -1.0, NAN, INF):
         assert refusal(**{name: value}) == f"{name} = {value}: expected a number > 0"

@@ -137,15 +137,29 @@ def test_the_microbatch_changes_nothing(draw_variables):
         jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, rtol=1e-4, atol=1e-6), result, whole)
 
 
-def test_the_learning_rate_falls_to_zero_over_all_updates():
-    config = dataclasses.replace(BASE, anneal=True, total_steps=2 * BASE.batch_size, max_grad_norm=1e9)
-    optimiser = learner.make_optimiser(config)
+def rates(steps, **options):
+    """Adam's step on a constant gradient, which is its learning rate, over that many steps."""
+    optimiser = learner.make_optimiser(dataclasses.replace(BASE, max_grad_norm=1e9, **options))
     state, sizes = optimiser.init(jnp.zeros(())), []
-    # Two updates of four epochs of two minibatches; Adam's step on a constant gradient is its rate.
-    for _ in range(17):
+    for _ in range(steps):
         step, state = optimiser.update(jnp.ones(()), state, jnp.zeros(()))
         sizes.append(-float(step))
-    np.testing.assert_allclose(sizes, 0.03 * (1 - np.arange(17) / 16), atol=1e-5)
+    return sizes
+
+
+def test_the_learning_rate_falls_to_zero_over_all_updates():
+    # Two updates of four epochs of two minibatches.
+    found = rates(17, anneal=True, warm_start="none", total_steps=2 * BASE.batch_size)
+    np.testing.assert_allclose(found, 0.03 * (1 - np.arange(17) / 16), atol=1e-5)
+
+
+def test_the_warm_start_has_a_learning_rate_of_its_own():
+    # One update of imitation, then two from rewards.
+    options = {"warm_start_steps": BASE.batch_size, "total_steps": 3 * BASE.batch_size}
+    found = rates(24, anneal=True, warm_start_learning_rate=0.5, **options)
+    np.testing.assert_allclose(found[:8], 0.5, atol=1e-5)
+    np.testing.assert_allclose(found[8:], 0.03 * (1 - np.arange(16) / 16), atol=1e-5)
+    np.testing.assert_allclose(rates(24, warm_start_learning_rate=0.5, **options)[8:], 0.03, atol=1e-5)
 
 
 def test_gradients_are_scaled_down_to_the_largest_norm():
