@@ -6,7 +6,7 @@ import numpy as np
 
 from jaxtrack import StaticParams
 from jaxtrack.env import SearchTrack
-from train.checkpoint import learner_shapes, save, updates
+from train.checkpoint import learner_shapes, load_newest, save, updates
 from train.config import TrainConfig
 from train.metrics_file import CLOCK
 from train.saved_run import write_config
@@ -24,6 +24,24 @@ CONFIG = TrainConfig(
     static=STATIC,
 )
 NAMES = ("policy_loss", "value_loss", "gradient_norm", "reward", "episode_return", "completeness")
+
+OPTIONS = {
+    "num-envs": 4,
+    "rollout-steps": 8,
+    "num-minibatches": 2,
+    "microbatch": 8,
+    "epochs": 1,
+    "static.num-truths": 2,
+    "static.max-tracks": 3,
+    "static.max-detections": 2,
+    "static.max-clutter": 0,
+    "static.map-size": 6,
+    "static.num-looks": 3,
+    "params.max-steps-in-episode": 6,
+    "params.beam-azimuth": 0.9,
+    "params.beam-elevation": 0.9,
+}
+"""Options of a run that is really trained, in milliseconds per update."""
 
 
 def random_state():
@@ -76,3 +94,9 @@ def without_clock(folder):
     lines = [line.split(",") for line in (folder / "metrics.csv").read_text().splitlines()]
     kept = [place for place, name in enumerate(lines[0]) if name not in CLOCK]
     return [[cells[place] for place in kept] for cells in lines]
+
+
+def assert_same_result(folder, reference):
+    """Bit for bit: the whole last learner state, and the metrics but for the clock's columns."""
+    assert_same(*(load_newest(each).arrays for each in (folder, reference)))
+    assert without_clock(folder) == without_clock(reference)

@@ -18,7 +18,7 @@ from train.saved_run import load_run
 from train.sealed import seal_of
 
 UPDATES = (10, 20)
-EXPLODED = []
+EXPLODED = "unpickled"
 
 
 @pytest.fixture(scope="module")
@@ -43,10 +43,13 @@ def intact(state, tmp_path_factory):
 
 
 class Exploding:
-    """Tells when it is unpickled."""
+    """Makes a folder when it is unpickled."""
+
+    def __init__(self, folder):
+        self.folder = str(folder)
 
     def __reduce__(self):
-        return EXPLODED.append, (1,)
+        return os.mkdir, (self.folder,)
 
 
 def truncate(path, rng):
@@ -172,7 +175,7 @@ def claim_a_huge_array(path, rng):
 
 def pickle_something(path, rng):
     def change(arrays, buffer):
-        np.savez(buffer, **{**arrays, "key": np.array([Exploding()], dtype=object)})
+        np.savez(buffer, **{**arrays, "key": np.array([Exploding(path.parent / EXPLODED)], dtype=object)})
 
     change_within(path, change)
 
@@ -208,7 +211,7 @@ def test_damage_is_never_loaded(intact, state, tmp_path, capsys, number):
         shutil.copytree(intact, folder)
         kind(folder / file, rng)
         told[outcome(folder, state, capsys)] += 1
-    assert EXPLODED == []
+    assert not list(tmp_path.rglob(EXPLODED))
     assert sum(told.values()) == number
     assert all(told.values())
     with capsys.disabled():

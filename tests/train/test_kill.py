@@ -4,6 +4,7 @@ pytest -m slow tests/train/test_kill.py                # 20 kills
 KILLS=100 pytest -m slow tests/train/test_kill.py      # as many as wanted
 """
 
+import math
 import os
 import random
 import re
@@ -15,8 +16,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.train.small_run import assert_same, without_clock
-from train.checkpoint import load_newest, updates
+from tests.train.small_run import OPTIONS, assert_same_result, without_clock
+from train.checkpoint import updates
 from train.saved_run import load_run
 
 pytestmark = pytest.mark.slow
@@ -26,25 +27,7 @@ KILLS = int(os.environ.get("KILLS", "20"))
 LIMIT = 600
 """Seconds for one part of a training, compiling included, on a busy machine."""
 UPDATES = 1000
-SIZES = {
-    "num-envs": 4,
-    "rollout-steps": 8,
-    "num-minibatches": 2,
-    "microbatch": 8,
-    "epochs": 1,
-    "total-steps": 32 * UPDATES,
-    "evaluation-episodes": 0,
-    "checkpoint-every": 2,
-    "static.num-truths": 2,
-    "static.max-tracks": 3,
-    "static.max-detections": 2,
-    "static.max-clutter": 0,
-    "static.map-size": 6,
-    "static.num-looks": 3,
-    "params.max-steps-in-episode": 6,
-    "params.beam-azimuth": 0.9,
-    "params.beam-elevation": 0.9,
-}
+SIZES = {**OPTIONS, "total-steps": 32 * UPDATES, "evaluation-episodes": 0, "checkpoint-every": 2}
 
 
 @pytest.fixture(scope="module")
@@ -94,7 +77,7 @@ def test_killed_at_random_moments_and_resumed(start, whole, tmp_path, capsys):
     reference, seconds = whole
     draw = random.Random(KILLS)
     kills, done = 0, []
-    for round_number in range(1 + KILLS // 20):
+    for round_number in range(math.ceil(KILLS / 20)):
         folder = tmp_path / f"killed-{round_number}"
         process = start(*new(folder))
         for kill in range(min(20, KILLS - kills)):
@@ -111,8 +94,7 @@ def test_killed_at_random_moments_and_resumed(start, whole, tmp_path, capsys):
             process = start("--resume", folder) if (folder / "config.json").exists() else start(*new(folder))
         code, said = finish(process)
         assert code == 0, said
-        assert_same(*(load_newest(each).arrays for each in (folder, reference)))
-        assert without_clock(folder) == without_clock(reference)
+        assert_same_result(folder, reference)
     with capsys.disabled():
         print(f" {kills} kills, after updates {done} of {UPDATES} ", end="")
 
@@ -151,7 +133,7 @@ def test_a_signal_ends_with_its_code_and_a_second_one_at_once(start, whole, tmp_
     assert updates(folder)[-1] >= rows
     process = start("--resume", folder)
     assert finish(process)[0] == 0
-    assert_same(*(load_newest(each).arrays for each in (folder, whole[0])))
+    assert_same_result(folder, whole[0])
 
 
 def wait_for_words(process, words):

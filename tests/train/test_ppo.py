@@ -12,36 +12,19 @@ import pytest
 from jaxtrack import StaticParams
 from jaxtrack.cli import run
 from jaxtrack.policies import POLICIES
+from tests.train.small_run import OPTIONS, assert_same_result
 from train import evaluate, ppo
-from train.checkpoint import load_newest, updates
+from train.checkpoint import updates
 from train.episode_metrics import METRICS
 from train.figures import FIGURES
-from train.metrics_file import CLOCK, MetricsFile
+from train.metrics_file import MetricsFile
 from train.saved_run import load_run
 
 pytestmark = pytest.mark.usefixtures("quick_compilation")
 
 BASELINES = {name: POLICIES[name] for name in ("static", "coverage")}
 PICTURES = ["learning_curve.png", "episode.gif", *(f"{name}.png" for name in FIGURES)]
-SIZES = {
-    "num-envs": 4,
-    "rollout-steps": 8,
-    "num-minibatches": 2,
-    "microbatch": 8,
-    "epochs": 1,
-    "total-steps": 100,
-    "evaluation-episodes": 2,
-    "checkpoint-every": 2,
-    "static.num-truths": 2,
-    "static.max-tracks": 3,
-    "static.max-detections": 2,
-    "static.max-clutter": 0,
-    "static.map-size": 6,
-    "static.num-looks": 3,
-    "params.max-steps-in-episode": 6,
-    "params.beam-azimuth": 0.9,
-    "params.beam-elevation": 0.9,
-}
+SIZES = {**OPTIONS, "total-steps": 100, "evaluation-episodes": 2, "checkpoint-every": 2}
 SMALL = [f"--{name}={value}" for name, value in SIZES.items()]
 
 
@@ -154,22 +137,6 @@ def stop_at(monkeypatch):
         monkeypatch.setattr(MetricsFile, "write", write_and_stop)
 
     return plan
-
-
-def assert_same_result(folder, reference):
-    """Bit for bit: the whole last learner state, and the metrics but for the clock's columns."""
-    one, other = load_newest(folder), load_newest(reference)
-    assert one.update == other.update
-    assert list(one.arrays) == list(other.arrays)
-    for name, array in one.arrays.items():
-        assert array.dtype == other.arrays[name].dtype
-        np.testing.assert_array_equal(array, other.arrays[name], strict=True)
-    assert without_clock(folder) == without_clock(reference)
-
-
-def without_clock(folder):
-    """The rows of metrics.csv without the columns that no two runs share."""
-    return [{name: cell for name, cell in row.items() if name not in CLOCK} for row in read_rows(folder)]
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])

@@ -12,7 +12,15 @@ import jax.numpy as jnp
 import pytest
 
 from jaxtrack.cli import run
-from tests.train.small_run import CONFIG, assert_same, random_state, step, without_clock, write_run
+from tests.train.small_run import (
+    CONFIG,
+    assert_same,
+    assert_same_result,
+    random_state,
+    step,
+    without_clock,
+    write_run,
+)
 from train import ppo, run_folder
 from train.checkpoint import load_newest, updates
 from train.config import to_dict
@@ -77,11 +85,6 @@ def stopped(train, tmp_path):
     assert train.start(folder, step=stopping(6))[0] == 9
     assert updates(folder) == [2, 4]
     return folder
-
-
-def assert_same_result(folder, reference):
-    assert_same(*(load_newest(each).arrays for each in (folder, reference)))
-    assert without_clock(folder) == without_clock(reference)
 
 
 @pytest.mark.parametrize("at", range(1, 11))
