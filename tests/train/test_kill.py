@@ -4,7 +4,6 @@ pytest -m slow tests/train/test_kill.py                # 20 kills
 KILLS=100 pytest -m slow tests/train/test_kill.py      # as many as wanted
 """
 
-import math
 import os
 import random
 import re
@@ -77,23 +76,25 @@ def test_killed_at_random_moments_and_resumed(start, whole, tmp_path, capsys):
     reference, seconds = whole
     draw = random.Random(KILLS)
     kills, done = 0, []
-    for round_number in range(math.ceil(KILLS / 20)):
-        folder = tmp_path / f"killed-{round_number}"
+    while kills < KILLS:
+        folder = tmp_path / f"killed-{kills}"
         process = start(*new(folder))
         for kill in range(min(20, KILLS - kills)):
             if kill % 5 == 4:
                 time.sleep(draw.uniform(0, 6))  # while it starts
             else:
                 wait_for_rows(process, folder)
-                time.sleep(draw.uniform(0, seconds / 20))
+                time.sleep(draw.uniform(0, seconds / 40))
             process.kill()
             process.communicate(timeout=LIMIT)
-            assert process.returncode == -signal.SIGKILL, "it ended before it was killed"
+            if process.returncode == 0:  # it was quicker
+                break
             kills += 1
             done.append(updates(folder)[-1] if updates(folder) else 0)
             process = start("--resume", folder) if (folder / "config.json").exists() else start(*new(folder))
-        code, said = finish(process)
-        assert code == 0, said
+        else:
+            code, said = finish(process)
+            assert code == 0, said
         assert_same_result(folder, reference)
     with capsys.disabled():
         print(f" {kills} kills, after updates {done} of {UPDATES} ", end="")
