@@ -3,11 +3,15 @@
 A track is identified by its birth step together with its birth detection, which both are
 kept in the metadata of the detection that initiated it. Sets have no order: a track list is
 always written in the order of these keys.
+
+Whole episodes are in `stone_soup_objects.py`.
 """
 
 import datetime
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from stonesoup.models.measurement.nonlinear import CartesianToElevationBearingRange
@@ -16,14 +20,18 @@ from stonesoup.types.array import StateVector
 from stonesoup.types.detection import Detection
 from stonesoup.types.groundtruth import GroundTruthPath, GroundTruthState
 from stonesoup.types.hypothesis import SingleHypothesis
+from stonesoup.types.prediction import GaussianStatePrediction
 from stonesoup.types.state import GaussianState, State
 from stonesoup.types.track import Track
 from stonesoup.types.update import GaussianStateUpdate
 
-from jaxtrack.types import NO_DETECTION, STATE_DIM, Tracks, Truths
+from jaxtrack.types import NEVER, NO_DETECTION, STATE_DIM, Tracks, Truths
 
 TrackKey = tuple[int, int]
 """Birth step and birth detection of a track."""
+
+Estimate = tuple[GaussianState, TrackKey, int]
+"""What a slot holds: a track's state, its key, and the detection that updated it, or `NO_DETECTION`."""
 
 
 def as_vector(state_vector: StateVector) -> np.ndarray:
@@ -57,8 +65,7 @@ def detection_index(detection: Detection) -> int:
 
 def track_key(track: Track) -> TrackKey:
     """Birth step and birth detection of a Stone Soup track."""
-    birth = track[0].hypothesis.measurement.metadata
-    return birth["step"], birth["index"]
+    return _numbers(track[0].hypothesis.measurement)
 
 
 def slot_keys(tracks: Tracks) -> list[TrackKey | None]:
@@ -95,24 +102,37 @@ def to_tracks(
     if len(ordered) > max_tracks:
         raise ValueError(f"{len(ordered)} tracks: expected at most max_tracks = {max_tracks}")
     keys = [track_key(track) for track in ordered]
-    mean = np.zeros((max_tracks, STATE_DIM))
-    covariance = np.zeros((max_tracks, STATE_DIM, STATE_DIM))
-    births = np.full((max_tracks, 2), NO_DETECTION)
-    source = np.full(max_tracks, NO_DETECTION)
-    for slot, (track, key) in enumerate(zip(ordered, keys, strict=True)):
-        mean[slot], covariance[slot] = as_vector(track.state_vector), track.covar
-        births[slot] = key
-        source[slot] = updated_by.get(key, NO_DETECTION)
-    active = np.arange(max_tracks) < len(ordered)
-    return Tracks(
-        mean=jnp.asarray(mean, float),
-        covariance=jnp.asarray(covariance, float),
-        active=jnp.asarray(active),
-        updated_by=jnp.asarray(source),
-        birth_step=jnp.asarray(births[:, 0]),
-        birth_detection=jnp.asarray(births[:, 1]),
-        age=jnp.asarray(np.where(active, step - births[:, 0], 0)),
-    )
+    held: list[Estimate | None] = [
+        (track.state, key, updated_by.get(key, NO_DETECTION))
+        for track, key in zip(ordered, keys, strict=True)
+    ]
+    return on_device(fill_slots(held + [None] * (max_tracks - len(held)), step))
+
+
+def fill_slots(held: Sequence[Estimate | None], step: int) -> Tracks:
+    """Track list on the host of what each slot holds on a step, None for an empty slot."""
+    slots = len(held)
+    rows: dict[str, Any] = {
+        "mean": np.zeros((slots, STATE_DIM)),
+        "covariance": np.zeros((slots, STATE_DIM, STATE_DIM)),
+        "active": np.zeros(slots, bool),
+        "updated_by": np.full(slots, NO_DETECTION),
+        "birth_step": np.full(slots, NEVER),
+        "birth_detection": np.full(slots, NO_DETECTION),
+        "age": np.zeros(slots, int),
+    }
+    for slot, estimate in enumerate(held):
+        if estimate is not None:
+            state, (birth_step, birth_detection), source = estimate
+            values = (as_vector(state.state_vector), state.covar, True, source, birth_step, birth_detection)
+            for row, value in zip(rows.values(), (*values, step - birth_step), strict=True):
+                row[slot] = value
+    return Tracks(**rows)
+
+
+def on_device(tracks: Tracks) -> Tracks:
+    """The same in JAX's arrays, at its precision."""
+    return jax.tree.map(lambda leaf: jnp.asarray(leaf, float if leaf.dtype.kind == "f" else None), tracks)
 
 
 def to_states(truths: Truths, time: datetime.datetime) -> list[State]:
@@ -121,39 +141,78 @@ def to_states(truths: Truths, time: datetime.datetime) -> list[State]:
     return [State(StateVector(state[row]), timestamp=time) for row in np.flatnonzero(truths.alive)]
 
 
-def _track(mean: np.ndarray, covariance: np.ndarray, key: TrackKey, time: datetime.datetime) -> Track:
+def _track(
+    mean: np.ndarray,
+    covariance: np.ndarray,
+    key: TrackKey,
+    time: datetime.datetime,
+    birth: Detection | None = None,
+) -> Track:
     """A track whose only state is the given one, with its key in the birth's metadata."""
-    birth = Detection(StateVector(np.zeros(3)), timestamp=time, metadata={"step": key[0], "index": key[1]})
-    state = GaussianState(StateVector(mean), covariance, timestamp=time)
-    return Track(
-        [
-            GaussianStateUpdate(
-                state.state_vector, state.covar, timestamp=time, hypothesis=SingleHypothesis(None, birth)
-            )
-        ]
-    )
+    if birth is None:
+        metadata = {"step": key[0], "index": key[1]}
+        birth = Detection(StateVector(np.zeros(3)), timestamp=time, metadata=metadata)
+    return Track([_update(mean, covariance, time, None, birth)], id=f"{key[0]}-{key[1]}")
 
 
-def to_track_histories(tracks: Tracks, times: Sequence[datetime.datetime]) -> dict[TrackKey, Track]:
+def _update(
+    mean: np.ndarray,
+    covariance: np.ndarray,
+    time: datetime.datetime,
+    prediction: GaussianStatePrediction | None,
+    detection: Detection,
+) -> GaussianStateUpdate:
+    hypothesis = SingleHypothesis(prediction, detection)
+    return GaussianStateUpdate(StateVector(mean), covariance, timestamp=time, hypothesis=hypothesis)
+
+
+def _prediction(mean: np.ndarray, covariance: np.ndarray, time: datetime.datetime) -> GaussianStatePrediction:
+    return GaussianStatePrediction(StateVector(mean), covariance, timestamp=time)
+
+
+def to_track_histories(
+    tracks: Tracks,
+    times: Sequence[datetime.datetime],
+    predicted: Tracks | None = None,
+    detections: Sequence[Mapping[int, Detection]] | None = None,
+) -> dict[TrackKey, Track]:
     """Whole Stone Soup tracks of a record `[K, T, ...]`, one for every key that it holds.
+
+    As in Stone Soup's tracker, a state is an `Update` where a detection updated the track, with
+    the hypothesis that joins prediction and detection, and a prediction elsewhere.
 
     Args:
         tracks: the record; slots may hold one track after another.
         times: time of every step.
+        predicted: the record of the predictions, for the hypotheses; without it they have none.
+        detections: the detections of every step by index; without them all states after a track's
+            first are predictions.
     """
-    active, mean = np.asarray(tracks.active), np.asarray(tracks.mean, float)
-    covariance = np.asarray(tracks.covariance, float)
+    active, source = np.asarray(tracks.active), np.asarray(tracks.updated_by)
+    mean, covariance = np.asarray(tracks.mean, float), np.asarray(tracks.covariance, float)
     births = np.stack([tracks.birth_step, tracks.birth_detection], axis=-1)
     histories: dict[TrackKey, Track] = {}
     for step, slot in np.argwhere(active):
-        birth_step, birth_detection = births[step, slot]
-        key, estimate = (int(birth_step), int(birth_detection)), (mean[step, slot], covariance[step, slot])
-        if key in histories:
-            state = GaussianState(StateVector(estimate[0]), estimate[1], timestamp=times[step])
-            histories[key].append(state)
+        key: TrackKey = tuple(births[step, slot].tolist())
+        estimate, time = (mean[step, slot], covariance[step, slot]), times[step]
+        detection = None if detections is None else detections[step].get(int(source[step, slot]))
+        if key not in histories:
+            # A record may begin in the middle of a track's life: then its birth's detection is not there.
+            known = detection is not None and _numbers(detection) == key
+            histories[key] = _track(*estimate, key, time, detection if known else None)
+        elif detection is None:
+            histories[key].append(_prediction(*estimate, time))
         else:
-            histories[key] = _track(*estimate, key, times[step])
+            prior = None
+            if predicted is not None:
+                before = predicted.mean[step, slot], predicted.covariance[step, slot]
+                prior = _prediction(np.asarray(before[0], float), np.asarray(before[1], float), time)
+            histories[key].append(_update(*estimate, time, prior, detection))
     return histories
+
+
+def _numbers(detection: Detection) -> TrackKey:
+    return detection.metadata["step"], detection.metadata["index"]
 
 
 def to_ground_truth_paths(truths: Truths, times: Sequence[datetime.datetime]) -> dict[int, GroundTruthPath]:
@@ -164,7 +223,8 @@ def to_ground_truth_paths(truths: Truths, times: Sequence[datetime.datetime]) ->
             [
                 GroundTruthState(StateVector(state[step, row]), timestamp=times[step])
                 for step in np.flatnonzero(alive[:, row]).tolist()
-            ]
+            ],
+            id=str(row),
         )
         for row in np.flatnonzero(alive.any(axis=0))
     }
