@@ -61,7 +61,8 @@ def expected_rewards(
     gained = _worths(state.tracks, updated, static, params) - missed
     track = jnp.sum(missed) + sum_in_beams(gained, predicted, looks, params)
     aged = update_scan_map(state.scan_map, jnp.full(2, jnp.nan), static, params)  # NaN looks nowhere
-    scan_value = mean_scan_value(aged) - pixels(aged) / aged.size
+    sharp = aged**static.search_sharpness
+    scan_value = mean_scan_value(sharp) - pixels(sharp) / sharp.size
     return params.track_weight * track - params.search_weight * scan_value
 
 

@@ -7,20 +7,21 @@ Counterparts in Stone Soup: `BruteForceSensorManager` with a `RewardFunction`.
 """
 
 import dataclasses
-from typing import TYPE_CHECKING
+from functools import partial
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
 
 from jaxtrack.expected_world import beam_pixels, expected_falls, expected_rewards, expected_step
 from jaxtrack.params import Params, StaticParams
-from jaxtrack.policies import Policy, PolicyBuilder, index, to_action
+from jaxtrack.policies import Policy, PolicyBuilder, gain, index, to_action
 from jaxtrack.scan_map import look_grid
 
 if TYPE_CHECKING:
     from jaxtrack.episode import EnvState
 
-REWARDS = ("information", "paper", "as_printed")
+REWARDS = ("information", "shortfall", "paper", "as_printed")
 """Rewards that a manager can expect: sums over tracks that need no truth."""
 
 
@@ -30,6 +31,7 @@ def greedy(
     *,
     reward: str = "information",
     search_weight: float | None = None,
+    search_sharpness: int | None = None,
 ) -> Policy:
     """The look with the largest expected reward of the next step.
 
@@ -38,11 +40,12 @@ def greedy(
         params: numbers.
         reward: one of `REWARDS`.
         search_weight: weight of the reward's search term, if not that of `params`.
+        search_sharpness: power of the scan values in it, if not that of `static`.
 
     Raises:
         ValueError: naming the reward, if it needs truths or does not exist.
     """
-    static, params = _planned(static, params, reward, search_weight)
+    static, params = _planned(static, params, reward, search_weight, search_sharpness)
     looks, pixels = look_grid(static, params), beam_pixels(static, params)
 
     def policy(key: jax.Array, state: "EnvState") -> jax.Array:
@@ -62,6 +65,7 @@ def rollout(
     base: PolicyBuilder = index,
     reward: str = "information",
     search_weight: float | None = None,
+    search_sharpness: int | None = None,
 ) -> Policy:
     """The look after which a base policy collects most reward in the expected world.
 
@@ -77,6 +81,7 @@ def rollout(
         base: builder of the base policy.
         reward: one of `REWARDS`.
         search_weight: weight of the reward's search term, if not that of `params`.
+        search_sharpness: power of the scan values in it, if not that of `static`.
 
     Raises:
         ValueError: naming the argument and its range.
@@ -88,7 +93,7 @@ def rollout(
         raise ValueError(f"horizon = {horizon}: expected an integer >= 0")
     if not 0 <= discount <= 1:
         raise ValueError(f"discount = {discount}: expected a number in [0, 1]")
-    static, params = _planned(static, params, reward, search_weight)
+    static, params = _planned(static, params, reward, search_weight, search_sharpness)
     looks, pixels = look_grid(static, params), beam_pixels(static, params)
     base_policy = base(static, params)
 
@@ -124,7 +129,15 @@ def uncertainty(static: StaticParams, params: Params) -> Policy:
     return policy
 
 
-MANAGERS: dict[str, PolicyBuilder] = {"greedy": greedy, "rollout": rollout, "uncertainty": uncertainty}
+PLAN: dict[str, Any] = {"reward": "shortfall", "search_weight": 10.0, "search_sharpness": 16}
+"""What the managers by name plan for, whatever the environment pays: an expected world finds no new
+tracks, so that searching must be worth something in itself."""
+
+MANAGERS: dict[str, PolicyBuilder] = {
+    "greedy": partial(greedy, **PLAN),
+    "rollout": partial(rollout, base=gain, **PLAN),
+    "uncertainty": uncertainty,
+}
 
 
 def expected_return(
@@ -149,11 +162,16 @@ def expected_return(
 
 
 def _planned(
-    static: StaticParams, params: Params, reward: str, search_weight: float | None
+    static: StaticParams,
+    params: Params,
+    reward: str,
+    search_weight: float | None,
+    search_sharpness: int | None,
 ) -> tuple[StaticParams, Params]:
     """The scenario with the reward that is planned for."""
     if reward not in REWARDS:
         raise ValueError(f"reward = {reward!r}: expected one of {', '.join(REWARDS)}, which need no truths")
     if search_weight is not None:
         params = dataclasses.replace(params, search_weight=search_weight)
-    return dataclasses.replace(static, reward=reward), params
+    sharpness = static.search_sharpness if search_sharpness is None else search_sharpness
+    return dataclasses.replace(static, reward=reward, search_sharpness=sharpness), params

@@ -13,7 +13,7 @@ import jax
 import numpy as np
 from flax import struct
 
-REWARDS = ("paper", "as_printed", "information", "gospa")
+REWARDS = ("paper", "as_printed", "information", "shortfall", "gospa")
 METRICS = (
     "gospa",
     "gospa_localisation",
@@ -65,7 +65,10 @@ class StaticParams:
     observe_variances: bool = False
     """The observation also has `variances`, of position and of velocity of every track (not the paper's)."""
     reward: str = "paper"
-    """Reward by name: paper, as_printed, information or gospa (which reads the truths)."""
+    """Reward by name: paper, as_printed, information, shortfall or gospa (which reads the truths)."""
+    search_sharpness: int = 1
+    """Power of every scan value in the reward's search term; a high one counts only what was never
+    seen, or long ago."""
     info_metrics: tuple[str, ...] = ()
     """More metrics of every step for `info`, by name; `jaxtrack.metrics.METRICS` lists them."""
     stop_metric: str | None = None

@@ -1,7 +1,7 @@
 """Rewards by name: pure functions of the track list before and after a step.
 
-Every reward is ``track_weight * track term - search_weight * mean scan value``; they differ
-in the track term. Only `gospa` reads the truths, which no real radar knows.
+Every reward is ``track_weight * track term - search_weight * mean of scan value ** search_sharpness``;
+they differ in the track term. Only `gospa` reads the truths, which no real radar knows.
 """
 
 from collections.abc import Callable
@@ -14,6 +14,9 @@ from jaxtrack.observation import covariance_norms
 from jaxtrack.params import Params, StaticParams
 from jaxtrack.scan_map import mean_scan_value
 from jaxtrack.types import NO_DETECTION, Tracks, Truths
+
+LOST_STEPS = 200.0
+"""`shortfall`: a deleted track costs as much as this many steps of being as uncertain as can be."""
 
 TrackTerm = Callable[[Tracks, Tracks, Truths, StaticParams, Params], jax.Array]
 
@@ -54,6 +57,24 @@ def information(
     return jnp.sum(jnp.where(after.active, worth, 0.0)) / static.num_truths
 
 
+def shortfall(
+    before: Tracks, after: Tracks, truths: Truths, static: StaticParams, params: Params
+) -> jax.Array:
+    """Minus the sum over live tracks of ``min(1, trace(P) / threshold)``, and a price for each deleted.
+
+    Per truth expected. A new track is worth nothing here: to find truths pays by the search term
+    alone, as much as there was to see, not by the luck of a truth being there. So it varies
+    far less from episode to episode than `information`, and is easier to learn from.
+    """
+    del truths
+    trace = jnp.trace(after.covariance, axis1=-2, axis2=-1)
+    cost = jnp.minimum(1.0, trace / params.deletion_threshold)
+    # A slot may hold a new track already.
+    kept = after.active & (after.birth_step == before.birth_step)
+    deleted = jnp.sum(before.active & ~kept)
+    return -(jnp.sum(jnp.where(after.active, cost, 0.0)) + LOST_STEPS * deleted) / static.num_truths
+
+
 def accuracy(
     before: Tracks, after: Tracks, truths: Truths, static: StaticParams, params: Params
 ) -> jax.Array:
@@ -72,6 +93,7 @@ TRACK_TERMS: dict[str, TrackTerm] = {
     "paper": covariance_reduction,
     "as_printed": covariance_growth,
     "information": information,
+    "shortfall": shortfall,
     "gospa": accuracy,
 }
 
@@ -86,5 +108,5 @@ def reward_terms(
 ) -> tuple[jax.Array, jax.Array]:
     """Weighted track term and weighted search term (negative); the reward is their sum."""
     track = params.track_weight * TRACK_TERMS[static.reward](before, after, truths, static, params)
-    search = -params.search_weight * mean_scan_value(scan_map)
+    search = -params.search_weight * mean_scan_value(scan_map**static.search_sharpness)
     return track, search

@@ -8,6 +8,7 @@ from stonesoup.types.track import Track
 from stonesoup.types.update import Update
 
 from jaxtrack.params import Params, StaticParams
+from jaxtrack.reward import LOST_STEPS
 
 
 @dataclass(frozen=True)
@@ -54,6 +55,9 @@ def track_term(
     if static.reward == "information":
         worth = (max(0.0, 1 - track.trace / params.deletion_threshold) for track in after.values())
         return sum(worth) / static.num_truths
+    if static.reward == "shortfall":
+        cost = sum(min(1.0, track.trace / params.deletion_threshold) for track in after.values())
+        return -(cost + LOST_STEPS * len(before.keys() - after.keys())) / static.num_truths
     signs = {"paper": 1.0, "as_printed": -1.0}
     fall = sum(
         before[track].norm - now.norm

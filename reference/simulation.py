@@ -93,7 +93,8 @@ class StoneSoupScenario:
         self.tracker.update_tracker(time_of(self.step_index, self.params), set(detections))
         self.slots.update(self.tracks)
         self.scan_map.look(azimuth, elevation)
-        scan_value = float(self.scan_map.value.mean())
+        scan_map = self.scan_map.value
+        unseen = float((scan_map**self.static.search_sharpness).mean())
         gospa = self.gospa() if self.static.reward == "gospa" else 0.0
         after, living = snapshot(self.tracks), len(self.paths)
         track = track_term(before, after, gospa, living, self.static, self.params)
@@ -101,9 +102,9 @@ class StoneSoupScenario:
             "live_tracks": len(self.tracks),
             "num_detections": len(detections),
             "covariance_norm_sum": self.covariance_norm_sum(),
-            "mean_scan_value": scan_value,
+            "mean_scan_value": float(scan_map.mean()),
             "reward_track": self.params.track_weight * track,
-            "reward_search": -self.params.search_weight * scan_value,
+            "reward_search": -self.params.search_weight * unseen,
         }
 
     @property

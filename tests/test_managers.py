@@ -175,6 +175,17 @@ def test_search_pays_by_its_weight(scenes, slow):
     assert (actions != act_on_all(greedy, scenes)).any()
 
 
+def test_search_pays_by_its_sharpness(scenes, slow):
+    after, rewards = slow
+    scan_map = np.asarray(after.scan_map, dtype=np.float64)
+    values = rewards["shortfall"] + PARAMS.search_weight * scan_map.mean(axis=(-2, -1))
+    values -= 30 * (scan_map**4).mean(axis=(-2, -1))
+    build = functools.partial(greedy, reward="shortfall", search_weight=30.0)
+    actions = act_on_all(functools.partial(build, search_sharpness=4), scenes)
+    assert_best(actions, values, margin=1e-5)
+    assert (actions != act_on_all(build, scenes)).any()
+
+
 def test_expected_step_is_that_of_the_tracker(scenes, slow):
     static = dataclasses.replace(STATIC, reward="paper")
     actions = jnp.stack(jnp.meshgrid(jnp.arange(L), jnp.arange(L), indexing="ij"), axis=-1).reshape(-1, 2)
@@ -257,7 +268,7 @@ def test_actions_lie_in_the_space_and_no_truth_is_read(name, scenes):
 @pytest.mark.parametrize(
     ("build", "numbers", "message"),
     [
-        (greedy, {"reward": "gospa"}, "reward = 'gospa': expected one of information, paper, as_printed"),
+        (greedy, {"reward": "gospa"}, "reward = 'gospa': expected one of information, shortfall, "),
         (rollout, {"reward": "nonsense"}, "reward = 'nonsense'"),
         (rollout, {"candidates": 0}, r"candidates = 0: expected an integer in \[1, 25\]"),
         (rollout, {"candidates": 26}, "candidates = 26"),

@@ -1,5 +1,7 @@
 """Reward terms by hand arithmetic."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -14,6 +16,7 @@ from jaxtrack.reward import (
     covariance_reduction,
     information,
     reward_terms,
+    shortfall,
 )
 
 STATIC = StaticParams(num_truths=4)
@@ -81,7 +84,21 @@ def test_information_uses_the_trace():
     assert float(information(after, after, NOBODY, STATIC, PARAMS)) == pytest.approx((1 - 0.3) / 4)
 
 
-@pytest.mark.parametrize(("name", "track"), [("paper", 0.4), ("as_printed", -0.4), ("information", 0.225)])
+def test_shortfall_charges_live_tracks_by_their_trace_and_deleted_ones_once():
+    before = track_list([9, 9, 9, 9], [0, 0, 0, 0], active=[True, True, False, True])
+    after = track_list([100, 1500, 250, 300], [NONE] * 4, active=[True, True, True, False])
+    # 0.1, at most 1, 0.25 for a new track; the last one was deleted.
+    assert float(shortfall(before, after, NOBODY, STATIC, PARAMS)) == pytest.approx(-(1.35 + 200) / 4)
+    # Deleted, and its slot taken at once.
+    replaced = after.replace(active=jnp.ones(4, bool), birth_step=after.birth_step.at[3].set(7))
+    assert float(shortfall(before, replaced, NOBODY, STATIC, PARAMS)) == pytest.approx(-(1.65 + 200) / 4)
+    # Nothing lost, nothing found: the empty slot costs nothing.
+    assert float(shortfall(before, before, NOBODY, STATIC, PARAMS)) == pytest.approx(-0.027 / 4)
+
+
+@pytest.mark.parametrize(
+    ("name", "track"), [("paper", 0.4), ("as_printed", -0.4), ("information", 0.225), ("shortfall", -0.025)]
+)
 def test_rewards_by_name_are_weighted_and_searching_costs_the_mean_scan_value(name, track):
     static = StaticParams(num_truths=4, reward=name)
     params = PARAMS.replace(track_weight=3.0, search_weight=0.5)
@@ -90,6 +107,10 @@ def test_rewards_by_name_are_weighted_and_searching_costs_the_mean_scan_value(na
     track_term, search_term = reward_terms(before, after, NOBODY, scan_map, static, params)
     assert float(track_term) == pytest.approx(3 * track)
     assert float(search_term) == pytest.approx(-0.5 * 0.4)
+    sharp = dataclasses.replace(static, search_sharpness=2)
+    terms = reward_terms(before, after, NOBODY, scan_map, sharp, params)
+    assert float(terms[0]) == float(track_term)
+    assert float(terms[1]) == pytest.approx(-0.5 * (0 + 1 + 0.25 + 0.01) / 4)
 
 
 def test_gospa_is_worth_one_for_perfect_tracks_and_nothing_without_any():

@@ -21,7 +21,7 @@ class TrainConfig:
     encoder: str = "beams"
     """Policy to train: beams (what a beam would search and what the tracks in it need), or the
     paper's track-list encoders flatten, bigru, mhsa."""
-    total_steps: int = 1_500_000
+    total_steps: int = 800_000
     """Environment steps, rounded down to whole updates."""
     num_envs: int = 64
     """Environments that run side by side."""
@@ -49,13 +49,13 @@ class TrainConfig:
     """Optimiser steps per pass."""
     microbatch: int = 128
     """Samples per piece of a gradient, for the cache; changes nothing but speed."""
-    learning_rate: float = 1e-4
+    learning_rate: float = 3e-4
     """Adam's step size when learning from rewards starts. Without a warm start, 3e-3 learns faster."""
     anneal: bool = True
     """Let the learning rate fall to zero from there, linearly."""
     gamma: float = 0.995
     """Discount per step."""
-    gae_lambda: float = 0.95
+    gae_lambda: float = 0.9
     """Decay of the advantage estimate."""
     clip: float = 0.2
     """Largest change of a probability ratio that is rewarded."""
@@ -69,10 +69,10 @@ class TrainConfig:
     """Factor on rewards in the learner, so that values are near 1; logged returns are unscaled."""
 
     static: StaticParams = dataclasses.field(
-        default_factory=lambda: StaticParams(reward="information", observe_variances=True)
+        default_factory=lambda: StaticParams(reward="shortfall", search_sharpness=16, observe_variances=True)
     )
     """Shapes of the environment."""
-    params: Params = dataclasses.field(default_factory=lambda: Params(search_weight=0.1))
+    params: Params = dataclasses.field(default_factory=lambda: Params(search_weight=3.0))
     """Numbers of the environment."""
 
     @property

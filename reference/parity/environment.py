@@ -27,7 +27,7 @@ from reference.simulation import StoneSoupScenario
 from reference.translate import as_vector
 from reference.truths import Draws
 
-STATIC = StaticParams(num_truths=12, max_tracks=40, max_detections=20, map_size=24)
+STATIC = StaticParams(num_truths=12, max_tracks=40, max_detections=20, map_size=24, search_sharpness=2)
 """Roomy: Stone Soup has no capacity."""
 
 LIVELY = Params(
