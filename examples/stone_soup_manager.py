@@ -25,6 +25,7 @@ from jaxtrack.types import POSITION
 from reference.components import build_components, gospa_metric
 from reference.parity.stock_metrics import siap_generator, track_to_truth
 from reference.policy_manager import PolicyManager, build_agile_radar
+from reference.simulation import StoneSoupScenario
 from reference.truths import initial_states, num_initial, truth_simulator
 from train.agents import agent_policy
 from train.saved_run import load_run
@@ -122,6 +123,7 @@ def chosen(options: ManagerOptions) -> tuple[str, PolicyBuilder, StaticParams, P
         require_file("picture", options.picture)
     if options.run is not None:
         config, env, weights = load_run(options.run)
+        StoneSoupScenario(env.static, config.params)  # refuses what is not simulated here
         return (
             str(options.run),
             agent_policy(config.encoder, weights, options.greedy),

@@ -1,10 +1,8 @@
-"""The only file that knows both worlds: Stone Soup's sets of objects and jaxtrack's records.
+"""Where Stone Soup's sets of objects become jaxtrack's records, and back.
 
 A track is identified by its birth step together with its birth detection, which both are
 kept in the metadata of the detection that initiated it. Sets have no order: a track list is
-always written in the order of these keys.
-
-Whole episodes are in `stone_soup_objects.py`.
+always written in the order of these keys. Whole episodes: `stone_soup_objects.py`.
 """
 
 import datetime

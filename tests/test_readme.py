@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[1]
-PAGES = ("README.md", "jaxtrack/README.md")
+PAGES = ("README.md", "jaxtrack/README.md", "docs/stone_soup.md")
 BLOCKS = [
     (page, number, block)
     for page in PAGES

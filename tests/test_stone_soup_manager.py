@@ -9,6 +9,8 @@ from examples.stone_soup_manager import ManagerOptions, chosen, judge, main, sim
 from jaxtrack import Params, StaticParams
 from jaxtrack.policies import POLICIES
 from tests.train.small_run import CONFIG, STATIC, random_state, write_run
+from train.checkpoint import save
+from train.saved_run import write_config
 
 pytestmark = pytest.mark.usefixtures("quick_compilation")
 
@@ -51,6 +53,14 @@ def test_a_trained_run_steers_in_the_scenario_that_it_was_trained_on(tmp_path, c
     played = simulate(build, static, params, 5, seed=0)
     assert len(played.paths) == STATIC.num_truths
     assert "using the checkpoint" in capsys.readouterr().out
+
+
+def test_a_run_whose_scenario_is_not_simulated_is_refused(tmp_path):
+    config = dataclasses.replace(CONFIG, params=dataclasses.replace(CONFIG.params, detection_probability=0.5))
+    write_config(tmp_path, config)
+    save(tmp_path, random_state(), config, "")
+    with pytest.raises(ValueError, match="detection_probability = 1"):
+        chosen(ManagerOptions(run=tmp_path))
 
 
 @pytest.mark.parametrize(
