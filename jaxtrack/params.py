@@ -33,6 +33,14 @@ MEASURES = (
     "squared_hellinger",
 )
 
+LARGEST = 1e9
+"""Largest number allowed where nothing smaller is: its fourth power is still a number in float32."""
+LARGEST_SHAPES = {"map_size": 4096, "num_looks": 1000}
+"""Largest shapes by name; all others end at `LARGEST_SHAPE`."""
+LARGEST_SHAPE = 10_000
+SMALLEST_SHAPES = {"max_clutter": 0, "map_size": 2, "num_looks": 2}
+"""Smallest shapes by name; all others begin at 1."""
+
 
 def looks_per_axis(field: float, beam: float) -> int:
     """Looks per axis so that overlapping beams cover the field (paper, eq. 1).
@@ -79,22 +87,26 @@ class StaticParams:
 
     def __post_init__(self) -> None:
         """Refuses shapes that make no sense, naming the field."""
-        low = {"max_clutter": 0, "map_size": 2, "num_looks": 2}
         for field in dataclasses.fields(self):
             value = getattr(self, field.name)
-            if field.type is int and (
-                isinstance(value, bool) or not isinstance(value, int) or value < low.get(field.name, 1)
-            ):
-                raise ValueError(f"{field.name} = {value!r}: expected an integer >= {low.get(field.name, 1)}")
+            if field.type is int:
+                low = SMALLEST_SHAPES.get(field.name, 1)
+                high = LARGEST_SHAPES.get(field.name, LARGEST_SHAPE)
+                if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
+                    raise ValueError(f"{field.name} = {value!r}: expected an integer in [{low}, {high}]")
+            elif field.type is bool and not isinstance(value, bool):
+                raise ValueError(f"{field.name} = {value!r}: expected True or False")
+        if not isinstance(self.info_metrics, tuple):
+            raise ValueError(f"info_metrics = {self.info_metrics!r}: expected a tuple of names")
         choices = [("reward", self.reward, REWARDS), ("measure", self.measure, MEASURES)]
         choices += [("info_metrics", name, METRICS) for name in self.info_metrics]
         choices += [("stop_metric", self.stop_metric, METRICS)] if self.stop_metric is not None else []
         for field_name, chosen, known in choices:
-            if chosen not in known:
+            if not isinstance(chosen, str) or chosen not in known:
                 raise ValueError(f"{field_name} = {chosen!r}: expected one of {', '.join(known)}")
 
 
-def _quantity(default: float, unit: str, low: float, high: float = math.inf, open_low: bool = False) -> Any:
+def _quantity(default: float, unit: str, low: float, high: float = LARGEST, open_low: bool = False) -> Any:
     """A traced number with its unit and the range that `validate` allows."""
     return struct.field(
         default=default,
@@ -106,7 +118,7 @@ def _quantity(default: float, unit: str, low: float, high: float = math.inf, ope
 class Params:
     """Numbers of the scenario, the tracker and the reward (traced; a change recompiles nothing)."""
 
-    time_step: float = _quantity(0.005, "s", 0.0, open_low=True)
+    time_step: float = _quantity(0.005, "s", 0.0, 1e6, open_low=True)
     """Time between looks (s)."""
     max_steps_in_episode: int = _quantity(1000, "steps", 1)  # gymnax reads this name
     """Length of an episode (steps)."""
@@ -118,9 +130,9 @@ class Params:
     beam_elevation: float = _quantity(math.radians(9), "rad", 0.0, math.pi, open_low=True)
     """Full width of the beam in boresight elevation (rad)."""
 
-    min_range: float = _quantity(1_000.0, "m", 0.0, open_low=True)
+    min_range: float = _quantity(1_000.0, "m", 1.0)
     """Smallest range at which a truth is born (m)."""
-    max_range: float = _quantity(10_000.0, "m", 0.0, open_low=True)
+    max_range: float = _quantity(10_000.0, "m", 1.0)
     """Largest range at which a truth is born; scale of the range observation (m)."""
     truth_velocity_sigma: float = _quantity(30.0, "m/s", 0.0)
     """Standard deviation of a truth's initial velocity, each axis (m/s)."""
@@ -135,9 +147,9 @@ class Params:
     trajectories: jax.Array | None = None
     """Recorded truths `[K, N, 6]` to replay instead of simulating; NaN where absent."""
 
-    elevation_sigma: float = _quantity(2e-3, "rad", 0.0, open_low=True)
+    elevation_sigma: float = _quantity(2e-3, "rad", 0.0, math.pi, open_low=True)
     """Standard deviation of measured elevation (rad)."""
-    bearing_sigma: float = _quantity(2e-3, "rad", 0.0, open_low=True)
+    bearing_sigma: float = _quantity(2e-3, "rad", 0.0, math.pi, open_low=True)
     """Standard deviation of measured bearing (rad)."""
     range_sigma: float = _quantity(5.0, "m", 0.0, open_low=True)
     """Standard deviation of measured range (m)."""
@@ -152,7 +164,7 @@ class Params:
     """Unscented transform: primary spread of the sigma points."""
     beta: float = _quantity(2.0, "1", 0.0)
     """Unscented transform: prior knowledge of the distribution (2 is best for a Gaussian)."""
-    kappa: float = _quantity(-3.0, "1", -6.0, open_low=True)
+    kappa: float = _quantity(-3.0, "1", -5.0)
     """Unscented transform: secondary spread of the sigma points."""
     gate_threshold: float = _quantity(5.0, "1", 0.0, open_low=True)
     """A detection is considered if its distance is smaller than this (unit of the measure)."""
@@ -160,7 +172,7 @@ class Params:
     """Distance at which a missed detection is the better explanation (unit of the measure)."""
     prior_velocity_sigma: float = _quantity(30.0, "m/s", 0.0, open_low=True)
     """Standard deviation of a new track's velocity, each axis (m/s)."""
-    deletion_threshold: float = _quantity(5_000.0, "m^2 + m^2/s^2", 0.0, open_low=True)
+    deletion_threshold: float = _quantity(5_000.0, "m^2 + m^2/s^2", 0.0, 1e18, open_low=True)
     """A track is deleted when the trace of its covariance exceeds this."""
 
     scan_time_constant: float = _quantity(1.0, "s", 0.0, open_low=True)
@@ -171,9 +183,9 @@ class Params:
     """Weight of the reward's search term."""
     stop_threshold: float | None = None
     """An episode ends when `stop_metric` exceeds this (the metric's unit)."""
-    gospa_cutoff: float = _quantity(200.0, "m", 0.0, open_low=True)
+    gospa_cutoff: float = _quantity(200.0, "m", 0.0, 1e6, open_low=True)
     """GOSPA cut-off c; also the distance within which a track counts for a truth (m)."""
-    gospa_order: float = _quantity(2.0, "1", 1.0)
+    gospa_order: float = _quantity(2.0, "1", 1.0, 5.0)
     """GOSPA order p."""
     gospa_switching_penalty: float = _quantity(0.0, "m", 0.0)
     """GOSPA over time: cost of a truth passing from one track to another; 0 switches it off (m)."""
@@ -204,6 +216,7 @@ def validate(static: StaticParams, params: Params) -> None:
     _check_stop(static, params)
     _check_initial_truths(static, params)
     check_trajectories(static, params)
+    _check_recording(params)
 
 
 def check_trajectories(static: StaticParams, params: Params) -> None:
@@ -217,31 +230,41 @@ def check_trajectories(static: StaticParams, params: Params) -> None:
             )
 
 
+def _check_recording(params: Params) -> None:
+    if params.trajectories is None:
+        return
+    recorded = np.asarray(params.trajectories)
+    if recorded.dtype.kind not in "iuf" or np.any(np.abs(recorded) > LARGEST):
+        raise ValueError(
+            f"trajectories: expected numbers in [{-LARGEST:g}, {LARGEST:g}] (m, m/s), or NaN where absent"
+        )
+
+
 def _check_stop(static: StaticParams, params: Params) -> None:
     if static.stop_metric is None and params.stop_threshold is None:
         return
-    threshold = params.stop_threshold
-    numeric = threshold is not None and np.asarray(threshold).dtype.kind in "fiu"
-    if not numeric or not np.all(np.isfinite(np.asarray(threshold, dtype=float))):
+    threshold = _numbers(params.stop_threshold)
+    if threshold is None or not np.all(np.isfinite(threshold)):
         raise ValueError(
-            f"stop_threshold = {threshold!r}: expected a number for stop_metric = {static.stop_metric!r}"
+            f"stop_threshold = {params.stop_threshold!r}: expected a number for "
+            f"stop_metric = {static.stop_metric!r}"
         )
 
 
 def _check_initial_truths(static: StaticParams, params: Params) -> None:
     if params.initial_truths is None:
         return
-    first = np.asarray(params.initial_truths)
-    if first.dtype.kind not in "iu" or np.any(first < 0) or np.any(first > static.num_truths):
+    first = _numbers(params.initial_truths)
+    if first is None or first.dtype.kind == "f" or np.any(first < 0) or np.any(first > static.num_truths):
         raise ValueError(
             f"initial_truths = {params.initial_truths!r}: expected an integer in [0, {static.num_truths}]"
         )
 
 
 def allowed_range(field: dataclasses.Field) -> str:
-    """Range of a number of `Params` in words, such as (0, inf): a square bracket includes the end."""
+    """Range of a number of `Params` in words, such as (0, 1]: a square bracket includes the end."""
     low, high = field.metadata["low"], field.metadata["high"]
-    return f"{'(' if field.metadata['open_low'] else '['}{low:g}, {high:g}{')' if math.isinf(high) else ']'}"
+    return f"{'(' if field.metadata['open_low'] else '['}{low:g}, {high:g}]"
 
 
 def with_unit(text: str, field: dataclasses.Field) -> str:
@@ -252,11 +275,23 @@ def with_unit(text: str, field: dataclasses.Field) -> str:
 
 def _check_quantity(field: dataclasses.Field, value: Any) -> None:
     low, high = field.metadata["low"], field.metadata["high"]
-    expected = f"expected a number in {with_unit(allowed_range(field), field)}"
-    try:
-        numbers = np.asarray(value, dtype=float)
-    except (TypeError, ValueError):
-        raise ValueError(f"{field.name} = {value!r}: {expected}") from None
-    above = numbers > low if field.metadata["open_low"] else numbers >= low
-    if not np.all(np.isfinite(numbers) & above & (numbers <= high)):
+    is_count = field.metadata["unit"] == "steps"
+    kind = "a whole number" if is_count else "a number"
+    expected = f"expected {kind} in {with_unit(allowed_range(field), field)}"
+    numbers = _numbers(value)
+    if numbers is None:
+        raise ValueError(f"{field.name} = {value!r}: {expected}")
+    inside = numbers > low if field.metadata["open_low"] else numbers >= low
+    inside &= numbers <= high
+    if is_count:
+        inside &= numbers == np.round(numbers)
+    if not np.all(inside):
         raise ValueError(f"{field.name} = {value}: {expected}")
+
+
+def _numbers(value: Any) -> np.ndarray | None:
+    """The number, or the array of numbers; nothing for text, True, a list, or an array without any."""
+    if isinstance(value, (list, tuple)):  # JAX would take it for a tree
+        return None
+    numbers = np.asarray(value)
+    return numbers if numbers.dtype.kind in "iuf" and numbers.size else None

@@ -146,10 +146,17 @@ def build_params(values: dict[str, Any]) -> Params:
             raise ValueError(f"{name}: no number of the tracker; expected one of {', '.join(TRACKER_FIELDS)}")
         if isinstance(value, (bool, list, dict)) or value is None:
             raise ValueError(f"{name} = {value!r}: expected a number")
-    params = Params(**values)
+    params = Params(**{name: _as_float(value) for name, value in values.items()})
     validate(StaticParams(), params)
-    numbers: dict[str, Any] = {name: float(value) for name, value in values.items()}
-    return dataclasses.replace(params, **numbers)
+    return params
+
+
+def _as_float(value: Any) -> Any:
+    """As float if it can be one; `validate` names what can not."""
+    try:
+        return float(value)
+    except (TypeError, ValueError, OverflowError):
+        return value
 
 
 def read_settings(settings: Sequence[str]) -> dict[str, str]:

@@ -166,7 +166,7 @@ def test_missing_fields_keep_their_defaults():
         ({"params": 3}, "params = 3: expected a table of fields"),
         ({"static": [1]}, "static = [1]: expected a table of fields"),
         # Wrong values of a right type are told where the record is built.
-        ({"static": {"num_truths": 0}}, "num_truths = 0: expected an integer >= 1"),
+        ({"static": {"num_truths": 0}}, "num_truths = 0: expected an integer in [1, 10000]"),
     ],
 )
 def test_a_wrong_entry_is_named_in_one_line(values, message):
