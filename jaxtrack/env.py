@@ -145,6 +145,8 @@ class SearchTrack(environment.Environment[EnvState, Params]):
         self, state: EnvState, action: jax.Array, noise: StepNoise, params: Params
     ) -> tuple[EnvState, StepRecord]:
         """All of a step but the scan map."""
+        if jnp.shape(action) != (2,):
+            raise ValueError(f"action has shape {jnp.shape(action)}: expected (2,), azimuth and elevation")
         time = state.time + 1
         truths, num_born, rowless = propagate_truths(state.truths, state.num_born, noise.truths, time, params)
         look = look_angles(action, self.static, params)
@@ -228,6 +230,9 @@ def make(
     Raises:
         ValueError: naming the wrong field and its range, or a field that does not exist.
     """
+    for name, value, kind in (("params", params, Params), ("static", static, StaticParams)):
+        if value is not None and not isinstance(value, kind):
+            raise ValueError(f"{name} = {value!r}: expected a {kind.__name__}")
     numbers = {field.name for field in dataclasses.fields(Params)}
     shapes = {field.name for field in dataclasses.fields(StaticParams)}
     unknown = sorted(set(fields) - numbers - shapes)
