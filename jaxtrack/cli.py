@@ -17,6 +17,8 @@ Options = TypeVar("Options")
 
 BAD_USAGE = 2
 INTERRUPTED = 130
+LARGEST_SEED = 2**32 - 1
+"""JAX takes larger ones too, and forgets what lies beyond 32 bits."""
 WIDTH = 150
 
 
@@ -76,24 +78,37 @@ def read_config(path: Path) -> dict[str, Any]:
     if path.suffix not in (".toml", ".json"):
         raise ValueError(f"config = {str(path)!r}: expected a .toml or .json file")
     try:
-        text = path.read_text()
-        values = tomllib.loads(text) if path.suffix == ".toml" else json.loads(text)
-    except (OSError, ValueError) as error:
+        text = path.read_text(encoding="utf-8-sig")
+        values = tomllib.loads(text) if path.suffix == ".toml" else _read_json(text)
+    except (OSError, ValueError, RecursionError) as error:
         raise ValueError(f"config = {str(path)!r}: {error}") from None
     if not isinstance(values, dict):
         raise ValueError(f"config = {str(path)!r}: expected a table of fields")
     return values
 
 
-def require_integer(name: str, value: int, low: int) -> None:
-    """Raises ValueError, naming the option, if its value is below `low`."""
-    if value < low:
-        raise ValueError(f"{name} = {value}: expected an integer >= {low}")
+def _read_json(text: str) -> Any:
+    """The values; like TOML it refuses a field that is given twice, of which Python takes the last."""
+
+    def table(fields: list[tuple[str, Any]]) -> dict[str, Any]:
+        names = [name for name, _ in fields]
+        if twice := next((name for name in names if names.count(name) > 1), None):
+            raise ValueError(f"{twice} is given twice")
+        return dict(fields)
+
+    return json.loads(text, object_pairs_hook=table)
+
+
+def require_integer(name: str, value: int, low: int, high: int | None = None) -> None:
+    """Raises ValueError, naming the option, if its value is below `low` or above `high`."""
+    if value < low or (high is not None and value > high):
+        allowed = f">= {low}" if high is None else f"in [{low}, {high}]"
+        raise ValueError(f"{name} = {value}: expected an integer {allowed}")
 
 
 def require_file(name: str, path: Path) -> None:
     """Raises ValueError, naming the option, if no file can be written at its path."""
-    if path.is_dir() or not path.parent.is_dir():
+    if "\0" in str(path) or path.is_dir() or not path.parent.is_dir():
         raise ValueError(f"{name} = {str(path)!r}: expected a file in a folder that exists")
 
 

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 import jax
 import numpy as np
 
-from jaxtrack.cli import parse, require_integer, run
+from jaxtrack.cli import LARGEST_SEED, parse, require_file, require_integer, run
 from jaxtrack.policies import POLICIES
 from jaxtrack.recording import Episode, record_episode
 from jaxtrack.scene import Scene
@@ -33,6 +33,10 @@ FRESH_FRAMES = 3
 """Detections stay visible for this many frames."""
 HOLD_LAST = 1500
 """How long a GIF rests on its last frame before it repeats (ms)."""
+LARGEST_STEPS = 1_000_000
+"""Longest episode; all its states are kept in memory."""
+LARGEST_FPS = 100
+"""A GIF counts time in hundredths of a second."""
 COLOURS = 64
 """Colours of a GIF, the same ones in every frame."""
 SUFFIXES = (".gif", ".mp4", ".png")
@@ -166,13 +170,17 @@ def check(options: Options) -> None:
     """Raises ValueError, naming the field, for an option that makes no sense."""
     if options.policy not in POLICIES:
         raise ValueError(f"policy = {options.policy!r}: expected one of {', '.join(POLICIES)}")
-    for name, low in (("seed", 0), ("steps", 1), ("fps", 1), ("stride", 0)):
-        require_integer(name, getattr(options, name), low)
+    for name, low, high in (
+        ("seed", 0, LARGEST_SEED),
+        ("steps", 1, LARGEST_STEPS),
+        ("fps", 1, LARGEST_FPS),
+        ("stride", 0, options.steps),
+    ):
+        require_integer(name, getattr(options, name), low, high)
     out = options.out
     if out.suffix not in SUFFIXES:
         raise ValueError(f"out = {str(out)!r}: expected a name that ends in {', '.join(SUFFIXES)}")
-    if not out.parent.is_dir():
-        raise ValueError(f"out = {str(out)!r}: the folder does not exist")
+    require_file("out", out)
 
 
 def draw(options: Options) -> str:

@@ -19,7 +19,7 @@ from rich.progress import (
 )
 from rich.text import Text
 
-from jaxtrack.cli import parse, require_integer, run, wide_console
+from jaxtrack.cli import LARGEST_SEED, parse, require_integer, run, wide_console
 from jaxtrack.env import SearchTrack
 from jaxtrack.managers import MANAGERS
 from jaxtrack.params import Params, StaticParams
@@ -33,6 +33,8 @@ from train.scenarios import build_scenario
 
 COMPARED_SEED = 1_000_000
 """Seed of the scenarios on which policies are compared, far from the seeds of training."""
+
+LARGEST_EPISODES = 1_000_000
 
 ALL, PLANNERS = "all", "planners"
 IMPORTANT_SHAPES = ("max_tracks", "map_size", "num_looks", "continuous_actions", "observe_variances")
@@ -92,14 +94,21 @@ def main(argv: Sequence[str]) -> int:
 
 def check(options: EvaluateOptions) -> None:
     """Raises ValueError, in one line, for options that make no sense."""
-    for name, low in (("episodes", 1), ("seed", 0)):
-        require_integer(name, getattr(options, name), low)
+    require_integer("episodes", options.episodes, 1, LARGEST_EPISODES)
+    require_integer("seed", options.seed, 0, LARGEST_SEED)
     for name in options.policies:
         if name not in (ALL, PLANNERS, *POLICIES, *MANAGERS):
             known = ", ".join([*POLICIES, *MANAGERS])
             raise ValueError(f"policies = {name!r}: expected {ALL}, {PLANNERS}, or some of {known}")
     if options.page is not None and options.out is None:
         raise ValueError("page: expected a folder for its figures too, --out")
+    # Before hours of playing, not after them.
+    if options.out is not None and (
+        "\0" in str(options.out) or (options.out.exists() and not options.out.is_dir())
+    ):
+        raise ValueError(f"out = {str(options.out)!r}: expected a folder")
+    if options.page is not None and ("\0" in str(options.page) or options.page.is_dir()):
+        raise ValueError(f"page = {str(options.page)!r}: expected a file")
 
 
 def check_shapes(folder: Path, config: TrainConfig, static: StaticParams) -> None:

@@ -78,14 +78,14 @@ def test_without_out_nothing_is_written(monkeypatch, tmp_path, capsys):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["--episodes", "0"], "episodes = 0: expected an integer >= 1"),
-        (["--seed", "-1"], "seed = -1: expected an integer >= 0"),
+        (["--episodes", "0"], "episodes = 0: expected an integer in [1, 1000000]"),
+        (["--seed", "-1"], "seed = -1: expected an integer in [0, 4294967295]"),
         (["--run", "nowhere"], "run = 'nowhere': expected a folder with a config.json"),
         (["--runs", "nowhere", "else"], "run = 'nowhere': expected a folder with a config.json"),
         (
             ["--policies", "index", "best"],
             "policies = 'best': expected all, planners, or some of random, static, coverage, stalest, "
-            "scheduler, index, index_tuned, greedy, rollout, uncertainty",
+            "scheduler, index, index_tuned, gain, greedy, rollout, uncertainty",
         ),
         (["--policies"], "policies: expected at least one name, or a run"),
         (["--scenario", "moon"], "scenario = 'moon': expected paper, clutter, slow, births, or a .toml"),
