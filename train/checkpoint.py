@@ -13,7 +13,7 @@ import platform
 from collections.abc import Callable
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -31,6 +31,7 @@ FORMAT = 1
 ABOUT = "about"
 
 Say = Callable[[str], None]
+Tree = TypeVar("Tree")
 
 
 class IncompatibleError(ValueError):
@@ -63,6 +64,16 @@ def save(folder: Path, state: LearnerState, config: TrainConfig, metrics_digest:
         OSError: naming the file; the checkpoints that were there still are.
     """
     update = int(state.update)
+    (folder / "checkpoints").mkdir(exist_ok=True)
+    write(_path(folder, update), state, update, config, metrics_digest)
+    # One of a later update is what a resumed training found damaged.
+    kept = [each for each in updates(folder) if each <= update][-KEPT:]
+    for other in set(updates(folder)) - set(kept):
+        remove_sealed(_path(folder, other))
+
+
+def write(path: Path, tree: Any, update: int, config: TrainConfig, metrics_digest: str = "") -> None:
+    """Writes arrays of a learner state, all of them or a part, into a sealed file."""
     about = {
         "format": FORMAT,
         "update": update,
@@ -71,13 +82,8 @@ def save(folder: Path, state: LearnerState, config: TrainConfig, metrics_digest:
         "metrics_digest": metrics_digest,
     }
     buffer = io.BytesIO()
-    np.savez(buffer, allow_pickle=False, **{ABOUT: np.array(json.dumps(about))}, **_by_name(state))
-    (folder / "checkpoints").mkdir(exist_ok=True)
-    write_sealed(_path(folder, update), buffer.getvalue())
-    # One of a later update is what a resumed training found damaged.
-    kept = [each for each in updates(folder) if each <= update][-KEPT:]
-    for other in set(updates(folder)) - set(kept):
-        remove_sealed(_path(folder, other))
+    np.savez(buffer, allow_pickle=False, **{ABOUT: np.array(json.dumps(about))}, **_by_name(tree))
+    write_sealed(path, buffer.getvalue())
 
 
 def updates(folder: Path) -> list[int]:
@@ -96,7 +102,9 @@ def load_newest(folder: Path, say: Say = print) -> Checkpoint | None:
     finished = [update for update in found if seal_of(_path(folder, update)).exists()]
     for update in reversed(found):
         try:
-            checkpoint = _read(folder, update)
+            checkpoint = read(_path(folder, update))
+            if checkpoint.update != update:
+                raise ValueError(f"{update}.npz holds update {checkpoint.update}")
         except IncompatibleError:
             raise
         except Exception as error:  # whatever damage does to the readers of JSON, zip and NumPy files
@@ -109,8 +117,13 @@ def load_newest(folder: Path, say: Say = print) -> Checkpoint | None:
     return None
 
 
-def _read(folder: Path, update: int) -> Checkpoint:
-    path = _path(folder, update)
+def read(path: Path) -> Checkpoint:
+    """Reads a sealed file.
+
+    Raises:
+        IncompatibleError: if a newer program wrote it.
+        Exception: of many kinds, if it is damaged.
+    """
     check_seal(path)
     with np.load(path, allow_pickle=False) as file:
         arrays = {name: file[name] for name in file.files}
@@ -120,17 +133,17 @@ def _read(folder: Path, update: int) -> Checkpoint:
             f"{path}: has format {about['format']}, expected at most {FORMAT}; "
             f"it was written with jaxtrack {about['written_with']['jaxtrack']}"
         )
-    if about["update"] != update:
-        raise ValueError(f"{path.name} holds update {about['update']}")
-    return Checkpoint(update, about["config"], about["written_with"], about["metrics_digest"], arrays)
+    return Checkpoint(
+        about["update"], about["config"], about["written_with"], about["metrics_digest"], arrays
+    )
 
 
-def restore(checkpoint: Checkpoint, shapes: LearnerState) -> LearnerState:
-    """The learner state of a checkpoint.
+def restore(checkpoint: Checkpoint, shapes: Tree) -> Tree:
+    """The learner state of a checkpoint, or the part that was written.
 
     Args:
         checkpoint: an intact one.
-        shapes: a learner state with the shapes and types that are expected.
+        shapes: the same with the shapes and types that are expected.
 
     Raises:
         ValueError: naming the first array that does not fit.
@@ -145,7 +158,8 @@ def restore(checkpoint: Checkpoint, shapes: LearnerState) -> LearnerState:
                 f"written with jaxtrack {wrote}"
             )
     leaves = [jnp.asarray(checkpoint.arrays[name]) for name in expected]
-    return jax.tree.unflatten(jax.tree.structure(shapes), leaves)
+    restored: Tree = jax.tree.unflatten(jax.tree.structure(shapes), leaves)
+    return restored
 
 
 def learner_shapes(env: SearchTrack, config: TrainConfig) -> LearnerState:

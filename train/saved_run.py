@@ -6,7 +6,16 @@ from pathlib import Path
 from typing import Any
 
 from jaxtrack.env import SearchTrack, make
-from train.checkpoint import Checkpoint, Say, learner_shapes, load_newest, restore
+from train.checkpoint import (
+    Checkpoint,
+    IncompatibleError,
+    Say,
+    learner_shapes,
+    load_newest,
+    read,
+    restore,
+    write,
+)
 from train.config import TrainConfig, check, first_difference, from_dict, to_dict
 from train.learner import LearnerState
 from train.sealed import read_json, write_whole
@@ -27,6 +36,10 @@ class SavedRun:
     env: SearchTrack
     checkpoint: Checkpoint | None = None
     state: LearnerState | None = None
+
+
+AGENT = "agent.npz"
+"""The weights alone, in the folder of an exported agent."""
 
 
 def write_config(folder: Path, config: TrainConfig) -> None:
@@ -64,21 +77,61 @@ def read_run(folder: Path, say: Say = print) -> SavedRun:
     checkpoint = load_newest(folder, say)
     if checkpoint is None:
         return SavedRun(config, env)
+    agree(folder, values, checkpoint)
+    return SavedRun(config, env, checkpoint, restore(checkpoint, learner_shapes(env, config)))
+
+
+def load_run(folder: Path, say: Say = print) -> tuple[TrainConfig, SearchTrack, Any]:
+    """Configuration, environment and latest weights of a run, or of an agent that was exported from one.
+
+    Raises:
+        ValueError: naming the folder or the file, if it holds no readable run.
+    """
+    if (folder / AGENT).exists():
+        return load_agent(folder)
+    run = read_run(folder, say)
+    if run.state is None:
+        raise ValueError(f"run = {str(folder)!r}: holds no checkpoint")
+    return run.config, run.env, run.state.weights
+
+
+def save_agent(run: SavedRun, folder: Path) -> None:
+    """Writes an agent: the configuration of a run and its weights, without the rest of the learner state.
+
+    Raises:
+        ValueError: if the run has no checkpoint.
+        OSError: naming the file.
+    """
+    if run.state is None or run.checkpoint is None:
+        raise ValueError("run: holds no checkpoint")
+    folder.mkdir(parents=True, exist_ok=True)
+    config = dataclasses.replace(run.config, out="")
+    write_config(folder, config)
+    write(folder / AGENT, run.state.weights, run.checkpoint.update, config)
+
+
+def load_agent(folder: Path) -> tuple[TrainConfig, SearchTrack, Any]:
+    """Configuration, environment and weights of an exported agent.
+
+    Raises:
+        ValueError: naming the file, if it is damaged or does not belong to the configuration.
+    """
+    config, values = read_config(folder)
+    try:
+        checkpoint = read(folder / AGENT)
+    except IncompatibleError:
+        raise
+    except Exception as error:  # whatever damage does to the readers of JSON, zip and NumPy files
+        raise ValueError(f"{folder / AGENT}: is damaged ({' '.join(str(error).split())})") from None
+    agree(folder, values, checkpoint)
+    env, _ = make(config.params, config.static)
+    return config, env, restore(checkpoint, learner_shapes(env, config).weights)
+
+
+def agree(folder: Path, values: dict[str, Any], checkpoint: Checkpoint) -> None:
+    """Raises ValueError, naming the field, if config.json is not what a checkpoint was trained with."""
     if found := first_difference(values, checkpoint.config):
         name, here, there = found
         raise ValueError(
             f"{folder / 'config.json'}: {name} = {here!r}, but the checkpoint was trained with {there!r}"
         )
-    return SavedRun(config, env, checkpoint, restore(checkpoint, learner_shapes(env, config)))
-
-
-def load_run(folder: Path, say: Say = print) -> tuple[TrainConfig, SearchTrack, Any]:
-    """Configuration, environment and latest weights of a run.
-
-    Raises:
-        ValueError: naming the folder or the file, if it holds no readable run.
-    """
-    run = read_run(folder, say)
-    if run.state is None:
-        raise ValueError(f"run = {str(folder)!r}: holds no checkpoint")
-    return run.config, run.env, run.state.weights
