@@ -58,7 +58,7 @@ class EvaluateOptions:
     seed: int = COMPARED_SEED
     """Seed of the scenarios."""
     scenario: str = ""
-    """paper, clutter, slow, births, or a .toml or .json file with fields of Params and
+    """paper, clutter, slow, crowd, agile, births, or a .toml or .json file with fields of Params and
     StaticParams; unset, that of the runs, or the paper's without a run."""
     greedy: bool = False
     """Let agents take their most probable look instead of sampling."""

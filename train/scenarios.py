@@ -14,6 +14,8 @@ SCENARIOS: dict[str, dict[str, Any]] = {
     "paper": {},
     "clutter": {"detection_probability": 0.9, "clutter_rate": 0.2},
     "slow": {"time_step": 0.05},
+    "crowd": {"num_truths": 20},
+    "agile": {"truth_process_noise": 400.0},
     "births": {"initial_truths": 5, "birth_rate": 0.005, "death_probability": 0.0005},
 }
 """Scenarios by name: what differs from the paper's."""

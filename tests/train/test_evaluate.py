@@ -88,7 +88,7 @@ def test_without_out_nothing_is_written(monkeypatch, tmp_path, capsys):
             "scheduler, index, index_tuned, gain, greedy, rollout, uncertainty",
         ),
         (["--policies"], "policies: expected at least one name, or a run"),
-        (["--scenario", "moon"], "scenario = 'moon': expected paper, clutter, slow, births, or a .toml"),
+        (["--scenario", "moon"], "scenario = 'moon': expected paper, clutter, slow, crowd, agile, births"),
         (["--scenario", "moon.toml"], "config = 'moon.toml': "),
         (["--scenario", "wrong.json"], "params.nonsense: no such field"),
         (["--scenario", "negative.json"], "time_step = -1: expected a number in (0"),
