@@ -19,6 +19,7 @@ settings.register_profile(
     derandomize=True,
     suppress_health_check=[HealthCheck.function_scoped_fixture],
 )
+settings.register_profile("thorough", settings.get_profile("jaxtrack"), max_examples=1000)
 settings.load_profile("jaxtrack")
 
 
