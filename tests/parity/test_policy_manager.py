@@ -1,15 +1,13 @@
 """Our policies as Stone Soup's sensor manager, against the same policies in our environment."""
 
 import datetime
+from functools import partial
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from stonesoup.sensor.radar.radar import RadarElevationBearingRange
-from stonesoup.types.array import StateVector
-from stonesoup.types.state import GaussianState
-from stonesoup.types.track import Track
 
 from jaxtrack import Params, StaticParams, policies
 from jaxtrack.env import SearchTrack
@@ -20,7 +18,7 @@ from reference.components import EPOCH, noise_covariance, time_of
 from reference.managers import ManagedRadar
 from reference.parity.environment import Played, draws_of
 from reference.parity.scenes import AHEAD, random_tracks
-from reference.policy_manager import PolicyManager, build_agile_radar
+from reference.policy_manager import PolicyManager, build_agile_radar, in_radar_frame
 from reference.radar import build_radar
 from reference.simulation import StoneSoupScenario
 from reference.translate import to_stone_soup_tracks
@@ -140,23 +138,28 @@ def test_a_radar_elsewhere_looks_at_the_same_things():
     place, orientation = np.array([500.0, -200, 30]), np.array([0.1, -0.2, 2.0])
     tracks = scene(3)
     turn = np.kron(np.asarray(rotation(jnp.asarray(orientation))), np.eye(2))
-    means = from_platform(tracks.mean, jnp.asarray(place), jnp.asarray(orientation))
-    there = {
-        Track([GaussianState(StateVector(mean), turn.T @ covariance @ turn, timestamp=EPOCH)])
-        for mean, covariance in zip(np.asarray(means)[:5], np.asarray(tracks.covariance)[:5], strict=True)
-    }
+    away = tracks.replace(
+        mean=from_platform(tracks.mean, jnp.asarray(place), jnp.asarray(orientation)),
+        covariance=turn.T @ tracks.covariance @ turn,
+    )
+    back = in_radar_frame(away, jnp.asarray(place), jnp.asarray(orientation))
+    live = np.asarray(tracks.active)
+    np.testing.assert_allclose(back.mean[live], tracks.mean[live], atol=1e-8)
+    np.testing.assert_allclose(back.covariance[live], tracks.covariance[live], atol=1e-8)
+
     radar = build_radar(PARAMS, ManagedRadar, place=tuple(place), orientation=tuple(orientation))
     radar.angles, radar.timestamp = pointing_radar().angles, EPOCH
-    time, build = time_of(1, PARAMS), POLICIES["scheduler"]
-    here = look_by(
-        PolicyManager(build, STATIC, PARAMS, sensors={pointing_radar()}),
-        to_stone_soup_tracks(tracks, EPOCH),
-        time,
-    )
-    np.testing.assert_array_equal(
-        look_by(PolicyManager(build, STATIC, PARAMS, sensors={radar}), there, time), here
-    )
-    assert np.any(here != pointing_radar().angles[0])
+    only_tracks = partial(policies.index, scan_weight=0.0)
+    looks = [
+        look_by(
+            PolicyManager(only_tracks, STATIC, PARAMS, sensors={one}),
+            to_stone_soup_tracks(seen, EPOCH),
+            time_of(1, PARAMS),
+        )
+        for one, seen in ((pointing_radar(), tracks), (radar, away))
+    ]
+    np.testing.assert_array_equal(looks[0], looks[1])
+    assert np.any(looks[0] != radar.angles[0])  # look 0 is the answer where no track is seen
 
 
 def test_the_map_ages_by_the_time_that_passed():

@@ -30,7 +30,7 @@ from reference.parity.stock_metrics import (
     track_to_truth,
 )
 from reference.stone_soup_objects import take_slots, to_stone_soup, to_track_record, to_trajectories
-from reference.translate import as_vector, track_key
+from reference.translate import as_vector, to_stone_soup_tracks, track_key
 
 pytestmark = pytest.mark.usefixtures("quick_compilation")
 
@@ -215,13 +215,13 @@ def test_stone_soups_plotter_draws_them(found):
 def test_stone_soups_writer_writes_them_and_its_readers_read_them_back(episode, tmp_path):
     env, params = make(**NUMBERS)
     policy = POLICIES["scheduler"](env.static, params)
-    short = to_stone_soup(record_episode(env, params, policy, jax.random.key(3), 40))
+    short = to_stone_soup(record_episode(env, params, policy, jax.random.key(3), 25))
     path = tmp_path / "episode.yaml"
     with YAMLWriter(path, tracks_source=short, groundtruth_source=short, detections_source=short) as writer:
         writer.write()
     ((when, tracks),) = YAMLTrackReader(path)
     assert when == short.times[-1]
-    ours = jax.tree.map(lambda leaf: leaf[:40], episode.states.tracks)
+    ours = jax.tree.map(lambda leaf: leaf[:25], episode.states.tracks)
     assert ours.active.any()
     assert_same_tracks(ours, to_track_record(tracks, env.static.max_tracks, short.times))
     ((_, paths),) = YAMLGroundTruthReader(path)
@@ -288,3 +288,15 @@ def test_a_track_keeps_its_slot_and_waits_where_none_is_free(params):
     ):
         slots = take_slots(slots, live)
         assert slots == held
+
+
+def test_tracks_born_together_take_slots_in_the_order_of_their_detections(params, tracks_at):
+    """Also where their states, by which others are told apart, have another order."""
+    means = np.arange(6.0)[:, None] * np.ones(6)
+    births = {"birth_step": np.zeros(6, int), "birth_detection": np.array([3, 0, 5, 1, 4, 2])}
+    tracks = to_stone_soup_tracks(tracks_at(means, 6, **births), time_of(0, params))
+    slots = take_slots([None] * 6, tracks)
+    assert [track_key(track) for track in slots] == [(0, row) for row in range(6)]
+    record = to_track_record(tracks, 6, first_step=0)
+    np.testing.assert_array_equal(record.birth_detection, [range(6)])
+    np.testing.assert_array_equal(record.mean[0, :, 0], [1, 3, 5, 0, 4, 2])
