@@ -53,6 +53,9 @@ def sort_fields(values: Mapping[str, Any]) -> dict[str, Any]:
     """Fields of a scenario as the tables `static` and `params`, in which they may already be."""
     shapes = {field.name for field in dataclasses.fields(StaticParams)}
     tables: dict[str, Any] = {name: values.get(name, {}) for name in TABLES}
+    for name, table in tables.items():
+        if not isinstance(table, Mapping):
+            raise ValueError(f"{name} = {table!r}: expected a table of fields")
     for name, value in values.items():
         if name not in TABLES:
             table = "static" if name in shapes else "params"
