@@ -5,6 +5,7 @@ import math
 from pathlib import Path
 from typing import Any, get_args, get_origin
 
+from jaxtrack.cli import LARGEST_SEED
 from jaxtrack.params import Params, StaticParams, validate
 from jaxtrack.policies import POLICIES
 from train.agents import AGENTS
@@ -114,7 +115,9 @@ def check(config: TrainConfig) -> None:
         _require(config, name, getattr(config, name) >= 1, "an integer >= 1")
     teachers = (NO_WARM_START, *POLICIES)
     _require(config, "warm_start", config.warm_start in teachers, f"one of {', '.join(teachers)}")
-    for name in ("evaluation_episodes", "seed", "warm_start_steps"):
+    in_range = 0 <= config.seed <= LARGEST_SEED
+    _require(config, "seed", in_range, f"an integer in [0, {LARGEST_SEED}]")
+    for name in ("evaluation_episodes", "warm_start_steps"):
         _require(config, name, getattr(config, name) >= 0, "an integer >= 0")
     _require(config, "checkpoint_every", config.checkpoint_every >= 1, "an integer >= 1")
     for name in _SHARES:

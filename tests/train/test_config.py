@@ -43,8 +43,13 @@ def test_counts_are_at_least_one(name):
         assert refusal(**{name: value}) == f"{name} = {value}: expected an integer >= 1"
 
 
-@pytest.mark.parametrize("name", ["seed", "evaluation_episodes"])
-def test_seed_and_evaluation_episodes_are_not_negative(name):
+@pytest.mark.parametrize("seed", [-1, 2**32])
+def test_seeds_have_32_bits(seed):
+    assert refusal(seed=seed) == f"seed = {seed}: expected an integer in [0, 4294967295]"
+
+
+@pytest.mark.parametrize("name", ["warm_start_steps", "evaluation_episodes"])
+def test_counts_that_may_be_zero_are_not_negative(name):
     assert refusal(**{name: -1}) == f"{name} = -1: expected an integer >= 0"
     check(TrainConfig(**{**SMALL, name: 0}))
 

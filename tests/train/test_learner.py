@@ -25,6 +25,7 @@ CONFIG = TrainConfig(
     microbatch=16,
     epochs=4,
     learning_rate=0.03,
+    warm_start_learning_rate=0.03,
     anneal=False,
     gamma=0.5,
     entropy_coefficient=0.0,
