@@ -22,12 +22,12 @@ from jaxtrack.types import NO_DETECTION, Detections, Tracks, where_rows
 def delete_uncertain_tracks(tracks: Tracks, params: Params) -> Tracks:
     """Deletes tracks whose covariance trace over all six states exceeds the threshold.
 
-    Strictly: a track exactly at the threshold lives; one whose trace is NaN does not (in Stone Soup
-    it lives for ever). Runs after the update and before initiation, so that a track can not die on
-    the step of its birth.
+    Strictly: a track exactly at the threshold lives, and so does one whose trace is NaN, as in Stone
+    Soup. Runs after the update and before initiation, so that a track can not die on the step of its
+    birth.
     """
     trace = add_up(jnp.diagonal(tracks.covariance, axis1=-2, axis2=-1), axis=-1)
-    return tracks.replace(active=tracks.active & (trace <= params.deletion_threshold))
+    return tracks.replace(active=tracks.active & ~(trace > params.deletion_threshold))
 
 
 def unassociated(detections: Detections, associated: jax.Array) -> jax.Array:

@@ -29,11 +29,6 @@ def test_deletion_is_strict_and_counts_all_six_states(x64):
     assert not bool(jnp.any(delete_uncertain_tracks(velocity_only, Params()).active))
 
 
-def test_a_track_whose_covariance_is_no_number_is_deleted(params):
-    kept = delete_uncertain_tracks(with_traces(np.nan, 1.0, np.inf), params)
-    np.testing.assert_array_equal(kept.active, [False, True, False])
-
-
 def test_deletion_wakes_no_empty_slot(params):
     tracks = with_traces(1.0, 1.0).replace(active=jnp.array([False, True]))
     np.testing.assert_array_equal(delete_uncertain_tracks(tracks, params).active, [False, True])
