@@ -102,6 +102,7 @@ def draw(played: Played, path: Path) -> None:
     import matplotlib
 
     matplotlib.use("Agg")
+    from matplotlib import pyplot
     from stonesoup.plotter import Plotter
 
     plotter = Plotter()
@@ -109,6 +110,7 @@ def draw(played: Played, path: Path) -> None:
     plotter.plot_measurements(played.detections, POSITION[:2], marker=".")
     plotter.plot_tracks(played.tracks, POSITION[:2], marker=".", markersize=2)
     plotter.fig.savefig(path)
+    pyplot.close(plotter.fig)
 
 
 def chosen(options: ManagerOptions) -> tuple[str, PolicyBuilder, StaticParams, Params]:

@@ -1,6 +1,7 @@
 """The python blocks of the README files run as they stand."""
 
 import re
+import sys
 from pathlib import Path
 
 import pytest
@@ -22,6 +23,8 @@ def test_block_runs_and_prints(page, block, capsys, request):
     if page != PAGES[0]:  # those of the first page are compiled as for a reader
         request.getfixturevalue("quick_compilation")
     exec(compile(block, page, "exec"), {"__name__": "__main__"})
+    if "matplotlib.pyplot" in sys.modules:
+        sys.modules["matplotlib.pyplot"].close("all")
     assert capsys.readouterr().out.strip()
 
 

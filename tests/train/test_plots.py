@@ -111,8 +111,9 @@ def test_a_comparison_with_holes_is_refused(tmp_path):
 def test_plots_leave_no_open_figures_and_import_matplotlib_lazily(tmp_path):
     from matplotlib import pyplot
 
+    before = pyplot.get_fignums()
     plots.comparison(TABLE, TITLES, tmp_path / "comparison.png")
-    assert pyplot.get_fignums() == []
+    assert pyplot.get_fignums() == before
     code = "import sys, train.plots; print('matplotlib' in sys.modules)"
     environment = {**os.environ, "JAX_PLATFORMS": "cpu", "PYTHONPATH": os.pathsep.join(sys.path)}
     result = subprocess.run(
