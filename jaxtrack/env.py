@@ -16,6 +16,7 @@ from jaxtrack.kernel import Function, one_by_one
 from jaxtrack.observation import TRACK_FEATURES, Observation, observe
 from jaxtrack.params import Params, StaticParams, check_trajectories, validate
 from jaxtrack.reward import reward_terms
+from jaxtrack.sampling import split
 from jaxtrack.scan_map import initial_scan_map, mean_scan_value, update_scan_map
 from jaxtrack.sensor import detect, look_angles
 from jaxtrack.truth import initiate_truths, propagate_truths
@@ -73,7 +74,7 @@ class SearchTrack(environment.Environment[EnvState, Params]):
     ) -> tuple[Observation, EnvState, jax.Array, jax.Array, jax.Array, dict[str, Any]]:
         """`step_env`, and a new episode where one ended: gymnax's `step`, which makes one at every step."""
         params = self.default_params if params is None else params
-        key_step, key_reset = jax.random.split(key)
+        key_step, key_reset = split(key)
         last, moved, reward, terminated, info = self.step_env(key_step, state, action, params)
         truncated = self.is_truncated(moved, params)
         done = terminated | truncated

@@ -16,6 +16,7 @@ import jax.numpy as jnp
 from jaxtrack.expected_world import beam_pixels, expected_falls, expected_rewards, expected_step
 from jaxtrack.params import Params, StaticParams
 from jaxtrack.policies import Policy, PolicyBuilder, gain, index, to_action
+from jaxtrack.sampling import first_largest
 from jaxtrack.scan_map import look_grid
 
 if TYPE_CHECKING:
@@ -50,7 +51,7 @@ def greedy(
 
     def policy(key: jax.Array, state: "EnvState") -> jax.Array:
         del key
-        return to_action(jnp.argmax(expected_rewards(state, looks, pixels, static, params)), static, params)
+        return to_action(first_largest(expected_rewards(state, looks, pixels, static, params)), static, params)
 
     return policy
 
@@ -109,7 +110,7 @@ def rollout(
             ),
             actions,
         )
-        return actions[jnp.argmax(returns)]
+        return actions[first_largest(returns)]
 
     return policy
 
@@ -124,7 +125,7 @@ def uncertainty(static: StaticParams, params: Params) -> Policy:
 
     def policy(key: jax.Array, state: "EnvState") -> jax.Array:
         del key
-        return to_action(jnp.argmax(expected_falls(state.tracks, looks, params)), static, params)
+        return to_action(first_largest(expected_falls(state.tracks, looks, params)), static, params)
 
     return policy
 

@@ -1,6 +1,7 @@
 """How good a track list is, given the truths: for evaluation, never for the agent."""
 
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -11,8 +12,6 @@ from jaxtrack.kernel import add_up, one_by_one
 from jaxtrack.observation import covariance_norms
 from jaxtrack.params import Params
 from jaxtrack.types import Scalar, Tracks, Truths, position
-
-_NO_STEP = -1
 
 
 class Gospa(struct.PyTreeNode):
@@ -195,12 +194,16 @@ def begins(tracks: Tracks) -> jax.Array:
 
     A slot may hold one track after another: they differ in birth step or birth detection.
     """
-    steps = jnp.arange(tracks.active.shape[0])[:, None]
-    last = jax.lax.cummax(jnp.where(tracks.active, steps, _NO_STEP), axis=0)
-    before = jnp.concatenate([jnp.full_like(last[:1], _NO_STEP), last[:-1]])
-    births = jnp.stack([tracks.birth_step, tracks.birth_detection], axis=-1)
-    earlier = jnp.take_along_axis(births, jnp.maximum(before, 0)[..., None], axis=0)
-    return tracks.active & ((before == _NO_STEP) | jnp.any(births != earlier, axis=-1))
+
+    def one_step(last: tuple[jax.Array, ...], now: tuple[jax.Array, ...]) -> tuple[Any, jax.Array]:
+        used, birth_step, birth_detection = last
+        active, step, detection = now
+        begun = active & (~used | (step != birth_step) | (detection != birth_detection))
+        last = used | active, jnp.where(active, step, birth_step), jnp.where(active, detection, birth_detection)
+        return last, begun
+
+    rows = tracks.active, tracks.birth_step, tracks.birth_detection
+    return jax.lax.scan(one_step, tuple(jnp.zeros_like(row[0]) for row in rows), rows)[1]
 
 
 def completeness(truths: Truths, tracks: Tracks, params: Params) -> jax.Array:

@@ -19,6 +19,7 @@ import jax.numpy as jnp
 from jaxtrack.models import elevation_bearing_range
 from jaxtrack.observation import variances
 from jaxtrack.params import Params, StaticParams
+from jaxtrack.sampling import draw_index, first_largest
 from jaxtrack.scan_map import beam_means, beam_sizes, look_grid
 from jaxtrack.sensor import in_beams, look_number
 from jaxtrack.types import Tracks, position
@@ -40,8 +41,7 @@ def random(static: StaticParams, params: Params) -> Policy:
     """A look drawn uniformly at every step (paper)."""
 
     def policy(key: jax.Array, state: "EnvState") -> jax.Array:
-        key = jax.random.fold_in(key, state.time)
-        return to_action(jax.random.randint(key, (), 0, static.num_looks**2), static, params)
+        return to_action(draw_index(key, state.time, static.num_looks**2), static, params)
 
     return policy
 
@@ -75,7 +75,7 @@ def stalest(static: StaticParams, params: Params) -> Policy:
 
     def policy(key: jax.Array, state: "EnvState") -> jax.Array:
         del key
-        return to_action(jnp.argmax(scan_values(state.scan_map)), static, params)
+        return to_action(first_largest(scan_values(state.scan_map)), static, params)
 
     return policy
 
@@ -95,9 +95,9 @@ def scheduler(
     def policy(key: jax.Array, state: "EnvState") -> jax.Array:
         del key
         share = trace_share(state.tracks, params)
-        worst = jnp.argmax(share)
+        worst = first_largest(share)
         towards_track = nearest_look(state.tracks.mean[worst], static, params)
-        stalest_look = jnp.argmax(scan_values(state.scan_map))
+        stalest_look = first_largest(scan_values(state.scan_map))
         index = jnp.where(share[worst] > revisit_share, towards_track, stalest_look)
         return to_action(index, static, params)
 
@@ -134,7 +134,7 @@ def index(
         share = trace_share(state.tracks, params, position_weight) ** exponent
         urgency = sum_in_beams(share, state.tracks, looks, params)
         value = scan_weight * scan_values(state.scan_map) ** sharpness + urgency
-        return to_action(jnp.argmax(value), static, params)
+        return to_action(first_largest(value), static, params)
 
     return policy
 
@@ -177,7 +177,7 @@ def gain(
         danger = trace_share(tracks, params) ** danger_exponent
         need = removed / variance_scale + danger_weight * danger
         unseen = areas * scan_values(state.scan_map**sharpness)
-        return to_action(jnp.argmax(unseen + sum_in_beams(need, tracks, looks, params)), static, params)
+        return to_action(first_largest(unseen + sum_in_beams(need, tracks, looks, params)), static, params)
 
     return policy
 

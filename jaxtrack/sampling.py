@@ -3,7 +3,7 @@
 import jax
 import jax.numpy as jnp
 
-from jaxtrack.kernel import stage
+from jaxtrack.kernel import one_by_one, stage
 from jaxtrack.types import Scalar
 
 _LANES = 16
@@ -16,6 +16,20 @@ def draw(key: jax.Array, num_normal: int, num_uniform: int) -> tuple[jax.Array, 
     numbers = stage(lambda key: _symmetric_uniform(key, length))(key)
     normal = stage(lambda uniform: jnp.sqrt(2.0).astype(uniform.dtype) * jax.lax.erf_inv(uniform))
     return normal(numbers[:num_normal]), (numbers[num_normal : num_normal + num_uniform] + 1) / 2
+
+
+def split(key: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Two new keys, as `jax.random.split`, which for a batch takes many kernels; the key is consumed."""
+    return one_by_one(lambda key: tuple(jax.random.split(key)))(key)
+
+
+def draw_index(key: jax.Array, time: jax.Array, number: int) -> jax.Array:
+    """Uniform index `[]` below `number`, another one at every time (steps) with the same key."""
+
+    def one(key: jax.Array, time: jax.Array) -> jax.Array:
+        return jax.random.randint(jax.random.fold_in(key, time), (), 0, number)
+
+    return one_by_one(one)(key, time)
 
 
 def _symmetric_uniform(key: jax.Array, length: int) -> jax.Array:
@@ -38,6 +52,15 @@ def poisson_quantile(uniform: jax.Array, rate: Scalar, largest: int) -> jax.Arra
     number = jnp.sum(uniform >= jnp.cumsum(terms))
     # Rounding of the last sums must not count anything where the rate is zero.
     return jnp.where(rate > 0, number, 0)
+
+
+def first_largest(values: jax.Array) -> jax.Array:
+    """Index `[]` of the largest of `values` `[R]`, the first of equals; 0 if one is NaN.
+
+    As `jnp.argmax`, which a CPU works out number by number.
+    """
+    rows = jnp.arange(values.shape[0])
+    return jnp.min(jnp.where(values < jnp.max(values), rows.size, rows))
 
 
 def places(chosen: jax.Array) -> jax.Array:

@@ -14,7 +14,7 @@ from jaxtrack.models import direction
 from jaxtrack.params import Params, StaticParams
 from jaxtrack.sensor import in_beam, look_angles
 
-BAND_SHARE = 8
+BAND_SHARE = 12
 """`beam_means` takes the short way if no beam crosses more than this part of the map's rows."""
 
 
@@ -96,7 +96,7 @@ def beam_means(static: StaticParams, params: Params) -> Callable[[jax.Array], ja
     """The function of a map `[M, M]` that gives the mean scan value in the beam of every look `[L * L]`.
 
     `beam_weights` times the map. A beam crosses few rows of the map, the same for all looks of
-    one elevation: where they are at most an eighth, only those are multiplied.
+    one elevation: where they are at most a twelfth, only those are multiplied.
     """
     looks, pixels = static.num_looks, static.map_size
     height = -(-pixels // BAND_SHARE)

@@ -8,15 +8,19 @@ stretch ends last; Stone Soup goes by the order of a set.
 """
 
 from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from flax import struct
 
+from jaxtrack.kernel import add_up, one_by_one
 from jaxtrack.metrics import begins, pairwise_distances
 from jaxtrack.params import Params
-from jaxtrack.track_to_truth import associate_tracks_to_truths, followed_until
+from jaxtrack.track_to_truth import Stretch, associate_tracks_to_truths
 from jaxtrack.types import Tracks, Truths, position, velocity
+
+_NEVER = -1
 
 
 class SiapAtTimes(struct.PyTreeNode):
@@ -72,29 +76,122 @@ def siap(truths: Truths, tracks: Tracks, times: jax.Array, params: Params) -> Si
         times: `[K]` times of the steps (s), rising.
         params: numbers of the metric.
     """
-    begun = begins(tracks)
-    stretches = associate_tracks_to_truths(truths, tracks, begun, params)
-    until = followed_until(stretches, truths.alive.shape[1])
-    steps = jnp.arange(until.shape[0])[:, None, None]
-    together = until >= steps  # [K, T, N]
-    counts = _counts(truths, tracks, together)
-    at_times = _ratios(*counts)
-    totals = _ratios(*(jnp.sum(count) for count in counts))
-
-    last = _last_steps(begun)
-    durations = jnp.diff(times)[:, None, None] * (until > steps)[:-1]  # [K - 1, T, N]
-    followed_time = jnp.sum(jnp.max(durations, axis=1))
-    changes = jnp.sum(jnp.maximum(tracks_needed(until, last, truths.alive) - 1, 0))
-    longest = jnp.sum(_longest_times(durations, begun))
+    durations = jnp.diff(times, append=times[-1:])  # nothing comes after the last step
+    # Step by step, every array is small: as one kernel for each record in turn, many times faster.
+    counts, followed_times, longest, changes = one_by_one(_over_record)(truths, tracks, durations, params)
     return Siap(
-        **vars(totals),
-        track_change_rate=_quotient(changes, followed_time),
-        longest_segment=_quotient(longest, jnp.sum(_lifetimes(truths.alive, times))),
-        at_times=at_times,
+        **vars(_ratios(*(jnp.sum(count) for count in counts))),
+        track_change_rate=_quotient(jnp.sum(changes), jnp.sum(followed_times)),
+        longest_segment=_quotient(jnp.sum(longest), jnp.sum(_lifetimes(truths.alive, times))),
+        at_times=_ratios(*counts),
     )
 
 
-def tracks_needed(until: jax.Array, last: jax.Array, alive: jax.Array) -> jax.Array:
+class _Behind(NamedTuple):
+    """What `_look_back` remembers of later steps, for every slot and truth `[T, N]`.
+
+    `start` and `end` are those of the stretch found last, which is the earliest; the others are of
+    the slot's present track: the last step of its last stretch, and its time (s) with the truth.
+    """
+
+    start: jax.Array
+    end: jax.Array
+    final: jax.Array
+    spent: jax.Array
+
+
+class _Found(NamedTuple):
+    """What one step of `_look_back` finds.
+
+    Attributes:
+        counts: J, JT, N, NA, sums of position and velocity errors, as `_ratios` takes them.
+        followed: time (s) to the next step, summed over the truths that are followed until then.
+        spent: `[N]` longest time (s) of a track with the truth, from this step on.
+        stretch_end: `[N]` see `tracks_needed`.
+    """
+
+    counts: tuple[jax.Array, ...]
+    followed: jax.Array
+    spent: jax.Array
+    stretch_end: jax.Array
+
+
+def _over_record(
+    truths: Truths, tracks: Tracks, durations: jax.Array, params: Params
+) -> tuple[tuple[jax.Array, ...], jax.Array, jax.Array, jax.Array]:
+    """Of a record: counts `[K]`, followed times `[K]`, longest times `[N]`, changes of track `[N]`."""
+    begun = begins(tracks)
+    stretches = associate_tracks_to_truths(truths, tracks, begun, params)
+    found = look_back(truths, tracks, begun, stretches, durations)
+    changes = jnp.maximum(tracks_needed(found.stretch_end, truths.alive) - 1, 0)
+    return found.counts, found.followed, found.spent, changes
+
+
+def look_back(
+    truths: Truths, tracks: Tracks, begun: jax.Array, stretches: Stretch, durations: jax.Array
+) -> _Found:
+    """Goes from the last step to the first: a stretch is known from its end on.
+
+    The leaves of the result are `[K, ...]`, but for `spent`, whose maximum over the record is `[N]`.
+
+    Args:
+        truths: `[K, N, ...]`.
+        tracks: `[K, T, ...]`.
+        begun: `[K, T]` where a slot takes up a new track.
+        stretches: `[K + 1, T]` of `associate_tracks_to_truths`.
+        durations: `[K]` time to the next step (s).
+    """
+    num_steps, num_truths = truths.alive.shape
+    max_tracks = begun.shape[1]
+
+    def one_step(carry: tuple[_Behind, jax.Array], now: Any) -> tuple[tuple[_Behind, jax.Array], _Found]:
+        behind, longest = carry
+        truths, tracks, begins, closed, duration, step = now
+        behind = _take_up(behind, closed)
+        together = (behind.start <= step) & (step <= behind.end)
+        going_on = together & (step < behind.end)
+        spent = behind.spent + jnp.where(going_on, duration, 0.0)
+        longest = jnp.maximum(longest, jnp.max(spent, axis=0))
+        found = _Found(
+            counts=_counts(truths, tracks, together),
+            followed=duration * jnp.sum(jnp.any(going_on, axis=0)),
+            spent=longest,
+            stretch_end=_stretch_end(behind, together),
+        )
+        # Before its first step the slot held another track, or none.
+        final = jnp.where(begins[:, None], _NEVER, behind.final)
+        spent = jnp.where(begins[:, None], 0.0, spent)
+        return (behind._replace(final=final, spent=spent), longest), found
+
+    never = jnp.full((max_tracks, num_truths), _NEVER)
+    nothing = jnp.zeros((max_tracks, num_truths), durations.dtype)
+    steps = jnp.arange(num_steps)
+    closed = jax.tree.map(lambda leaf: leaf[1:], stretches)
+    rows = (truths, tracks, begun, closed, durations, steps)
+    start = (_Behind(never, never, never, nothing), nothing[0])
+    (_, longest), found = jax.lax.scan(one_step, start, rows, reverse=True)
+    return found._replace(spent=longest)
+
+
+def _take_up(behind: _Behind, closed: Stretch) -> _Behind:
+    """Adds the stretches `[T]` that were closed on the step after this one."""
+    new = closed.truth[:, None] == jnp.arange(behind.end.shape[1])
+    end = jnp.where(new, closed.end[:, None], behind.end)
+    return behind._replace(
+        start=jnp.where(new, closed.start[:, None], behind.start),
+        end=end,
+        final=jnp.where(new & (behind.final == _NEVER), end, behind.final),
+    )
+
+
+def _stretch_end(behind: _Behind, together: jax.Array) -> jax.Array:
+    """`[N]` end of the present stretch of the track that is seen last with the truth; -1 without one."""
+    final = jnp.where(together, behind.final, _NEVER)
+    chosen = together & (final == jnp.max(final, axis=0))
+    return jnp.max(jnp.where(chosen, behind.end, _NEVER), axis=0)
+
+
+def tracks_needed(stretch_end: jax.Array, alive: jax.Array) -> jax.Array:
     """`[N]` tracks that a truth passes through, by Stone Soup's greedy walk over its life.
 
     On the first step with a track, the walk takes the track that will be seen last with the
@@ -102,16 +199,10 @@ def tracks_needed(until: jax.Array, last: jax.Array, alive: jax.Array) -> jax.Ar
     off, as Stone Soup's does, when it arrives on the very last step of a stretch.
 
     Args:
-        until: `[K, T, N]` of `followed_until`.
-        last: `[K, T]` last step of the present or next track of the slot.
+        stretch_end: `[K, N]` end of the present stretch of that track; -1 without one.
         alive: `[K, N]`.
     """
-    num_steps = until.shape[0]
-    steps = jnp.arange(num_steps)
-    together = until >= steps[:, None, None]
-    finally_ = jnp.where(together, jnp.take_along_axis(until, last[..., None], axis=0), -1)
-    chosen = together & (finally_ == jnp.max(finally_, axis=1, keepdims=True))
-    stretch_end = jnp.max(jnp.where(chosen, until, -1), axis=1)  # [K, N]
+    num_steps = alive.shape[0]
 
     def walk(carry: tuple[jax.Array, jax.Array], now: tuple[jax.Array, ...]) -> tuple:
         count, resume = carry
@@ -121,22 +212,22 @@ def tracks_needed(until: jax.Array, last: jax.Array, alive: jax.Array) -> jax.Ar
         return (count + taken, resume), None
 
     zero = jnp.zeros(alive.shape[1], dtype=int)
-    return jax.lax.scan(walk, (zero, zero), (steps, stretch_end, alive))[0][0]
+    return jax.lax.scan(walk, (zero, zero), (jnp.arange(num_steps), stretch_end, alive))[0][0]
 
 
 def _counts(truths: Truths, tracks: Tracks, together: jax.Array) -> tuple[jax.Array, ...]:
-    """J, JT, N, NA, sums of position and velocity errors: all `[K]`."""
+    """J, JT, N, NA, sums of position and velocity errors of one step; `together` is `[T, N]`."""
+    present = together & tracks.active[:, None] & truths.alive
 
     def errors(part: Callable[[jax.Array], jax.Array]) -> jax.Array:
-        distances = jax.vmap(pairwise_distances)(part(tracks.mean), part(truths.state))
-        return jnp.sum(jnp.where(present, distances, 0.0), axis=(1, 2))
+        distances = pairwise_distances(part(tracks.mean), part(truths.state))
+        return jnp.sum(add_up(jnp.where(present, distances, 0.0)))
 
-    present = together & tracks.active[:, :, None] & truths.alive[:, None]
     return (
-        jnp.sum(truths.alive, axis=-1),
-        jnp.sum(jnp.any(together, axis=1), axis=-1),
-        jnp.sum(tracks.active, axis=-1),
-        jnp.sum(jnp.any(together, axis=2), axis=-1),
+        jnp.sum(truths.alive),
+        jnp.sum(jnp.any(together, axis=0)),
+        jnp.sum(tracks.active),
+        jnp.sum(jnp.any(together, axis=1)),
         errors(position),
         errors(velocity),
     )
@@ -158,27 +249,6 @@ def _ratios(
         position_accuracy=_quotient(position_error, following),
         velocity_accuracy=_quotient(velocity_error, following),
     )
-
-
-def _longest_times(durations: jax.Array, begun: jax.Array) -> jax.Array:
-    """`[N]` longest time (s) that one track spent with a truth, over all its stretches."""
-
-    def one_step(carry: tuple[jax.Array, jax.Array], now: tuple[jax.Array, jax.Array]) -> tuple:
-        spent, longest = carry  # [T, N] by the present tracks, [N]
-        duration, begins = now
-        spent = jnp.where(begins[:, None], 0.0, spent) + duration
-        return (spent, jnp.maximum(longest, jnp.max(spent, axis=0))), None
-
-    nothing = jnp.zeros(durations.shape[1:])
-    return jax.lax.scan(one_step, (nothing, nothing[0]), (durations, begun[:-1]))[0][1]
-
-
-def _last_steps(begun: jax.Array) -> jax.Array:
-    """`[K, T]` step before the slot's next beginning, which is the last of its present track."""
-    num_steps = begun.shape[0]
-    at = jnp.where(begun, jnp.arange(num_steps)[:, None], num_steps)
-    later = jnp.concatenate([at[1:], jnp.full_like(at[:1], num_steps)])
-    return jax.lax.cummin(later, axis=0, reverse=True) - 1
 
 
 def _lifetimes(alive: jax.Array, times: jax.Array) -> jax.Array:

@@ -8,6 +8,7 @@ dated back, that exists for records only; `follow` alone can be carried from ste
 Where several truths are equally near, the lowest wins; Stone Soup goes by the order of a set.
 """
 
+import functools
 from typing import Any
 
 import jax
@@ -111,47 +112,33 @@ def associate_tracks_to_truths(truths: Truths, tracks: Tracks, begun: jax.Array,
         begun: `[K, T]` where a slot takes up a new track (`metrics.begins`).
         params: numbers of the metric.
     """
-    distances = jax.vmap(position_distances)(truths, tracks)  # [K, N, T]
-    near = jnp.min(distances, axis=1) < params.siap_threshold
-    nearest = jnp.where(near, jnp.argmin(distances, axis=1), NO_TRUTH)
     num_steps, max_tracks = begun.shape
     nobody = Following.nobody(max_tracks)
 
-    def one_step(following: Following, now: tuple[jax.Array, ...]) -> tuple[Following, Stretch]:
-        nearest, active, begins, step = now
+    def one_step(following: Following, now: tuple[Any, ...]) -> tuple[Following, Stretch]:
+        truths, tracks, begins, step = now
         left = _close(following, begins)
         following = _choose(begins, nobody, following)
-        after, ended = follow(following, nearest, step, params)
+        after, ended = follow(following, nearest_truth(truths, tracks, params), step, params)
+        active = tracks.active
         return _choose(active, after, following), _choose(begins, left, _choose(active, ended, left))
 
     steps = jnp.arange(num_steps)
-    end, closed = jax.lax.scan(one_step, nobody, (nearest, tracks.active, begun, steps))
+    end, closed = jax.lax.scan(one_step, nobody, (truths, tracks, begun, steps))
     still_open = _close(end, jnp.ones(max_tracks, dtype=bool))
     return jax.tree.map(lambda rows, row: jnp.concatenate([rows, row[None]]), closed, still_open)
 
 
-def followed_until(stretches: Stretch, num_truths: int) -> jax.Array:
-    """`[K, T, N]` end of the latest stretch of slot and truth that began by step k; -1 if none.
+def nearest_truth(truths: Truths, tracks: Tracks, params: Params) -> jax.Array:
+    """`[T]` truth nearest to every track and closer than the threshold, or `NO_TRUTH`."""
 
-    The slot's track follows the truth on step k where that is k or later, and from k to k + 1
-    where it is later.
+    def nearer(a: tuple[jax.Array, Any], b: tuple[jax.Array, Any]) -> tuple[jax.Array, Any]:
+        return jnp.minimum(a[0], b[0]), jnp.where(b[0] < a[0], b[1], a[1])
 
-    Args:
-        stretches: `[K + 1, T]`.
-        num_truths: N.
-    """
-    num_steps = stretches.truth.shape[0] - 1
-    slots = jnp.arange(stretches.truth.shape[1])
-    start = jnp.where(stretches.truth == NO_TRUTH, num_steps, stretches.start)  # outside: dropped
-    ends = jnp.full((num_steps, slots.size, num_truths), -1)
-    ends = ends.at[start, slots, stretches.truth].max(stretches.end, mode="drop")
-
-    def one_step(latest: jax.Array, ends: jax.Array) -> tuple[jax.Array, jax.Array]:
-        latest = jnp.maximum(latest, ends)
-        return latest, latest
-
-    # Many times faster than `jax.lax.cummax`.
-    return jax.lax.scan(one_step, ends[0], ends)[1]
+    # Truth by truth for all tracks at once: a CPU works out `jnp.argmin` number by number.
+    distances = jnp.unstack(position_distances(truths, tracks))
+    distance, truth = functools.reduce(nearer, [(row, number) for number, row in enumerate(distances)])
+    return jnp.where(distance < params.siap_threshold, truth, NO_TRUTH)
 
 
 def _close(following: Following, ends: jax.Array) -> Stretch:

@@ -10,13 +10,12 @@ from scipy.stats import chi2
 from jaxtrack import metrics
 from jaxtrack.env import SearchTrack
 from jaxtrack.episode import EnvState, StepRecord
-from jaxtrack.matrices import inverse_3x3
 from jaxtrack.params import Params
 from jaxtrack.reward import reward_terms
 from jaxtrack.scan_map import mean_scan_value
 from jaxtrack.sensor import look_number
 from jaxtrack.siap import siap
-from jaxtrack.types import STATE_DIM, Tracks, Truths, position, velocity
+from jaxtrack.types import STATE_DIM, Tracks, Truths, position
 
 METRICS = {
     "gospa": "GOSPA distance (m)",
@@ -88,6 +87,22 @@ def step_row(
     """Everything that is measured of one step."""
     truths, tracks = after.truths, after.tracks
     reward = reward_terms(before.tracks, tracks, truths, after.scan_map, env.static, params)
+    values, tracked = _of_tracks(truths, tracks, params)
+    return StepRow(
+        values={
+            **values,
+            "mean_scan_value": mean_scan_value(after.scan_map),
+            "reward": reward[0] + reward[1],
+        },
+        truths=truths,
+        tracks=tracks.replace(covariance=None),
+        tracked=tracked,
+        look=look_number(record.look, env.static, params),
+    )
+
+
+def _of_tracks(truths: Truths, tracks: Tracks, params: Params) -> tuple[dict[str, jax.Array], jax.Array]:
+    """What is measured of the track list, and which truths `[N]` have a track within the GOSPA cut-off."""
     distances = metrics.position_distances(truths, tracks)
     values = {
         **_gospa(truths, tracks, params),
@@ -97,16 +112,8 @@ def step_row(
         "covariance_norm_mean": metrics.covariance_norm_mean(tracks),
         "covariance_norm_sum": metrics.covariance_norm_sum(tracks),
         "uncertainty_per_truth": metrics.uncertainty_per_truth(truths, tracks, params),
-        "mean_scan_value": mean_scan_value(after.scan_map),
-        "reward": reward[0] + reward[1],
     }
-    return StepRow(
-        values=values,
-        truths=truths,
-        tracks=tracks.replace(covariance=None),
-        tracked=jnp.any(distances < params.gospa_cutoff, axis=-1),
-        look=look_number(record.look, env.static, params),
-    )
+    return values, jnp.any(distances < params.gospa_cutoff, axis=-1)
 
 
 def episode_values(rows: StepRow, params: Params) -> dict[str, jax.Array]:
@@ -155,17 +162,25 @@ def mean_wait(alive: jax.Array, tracked: jax.Array, params: Params) -> jax.Array
 
 
 def nees(error: jax.Array, covariance: jax.Array) -> jax.Array:
-    """Normalised estimation error squared ``e' P^-1 e`` of an error `[6]` with covariance `[6, 6]`.
+    """Normalised estimation errors squared ``e' P^-1 e`` `[...]` of errors `[..., 6]`, `[..., 6, 6]`.
 
-    The error of velocity is compared with what the error of position leads one to expect of it,
-    so that only 3 x 3 matrices need an inverse.
+    ``|w|^2`` with ``e = L w``, L the Cholesky factor of P, entry by entry: without arrays of entries
+    a CPU works it out in one loop over the tracks.
     """
-    inverse = inverse_3x3(covariance[0::2, 0::2])
-    cross = covariance[0::2, 1::2]
-    gain = cross.T @ inverse
-    surprise = velocity(error) - gain @ position(error)
-    left = covariance[1::2, 1::2] - gain @ cross
-    return position(error) @ inverse @ position(error) + surprise @ inverse_3x3(left) @ surprise
+    factor: list[list[jax.Array]] = []
+    white: list[jax.Array] = []
+    for i in range(STATE_DIM):
+        row: list[jax.Array] = []
+        for j in range(i):
+            row.append((covariance[..., i, j] - _dot(row, factor[j])) / factor[j][j])
+        row.append(jnp.sqrt(covariance[..., i, i] - _dot(row, row)))
+        white.append((error[..., i] - _dot(row, white)) / row[i])
+        factor.append(row)
+    return sum(part**2 for part in white)
+
+
+def _dot(a: list[jax.Array], b: list[jax.Array]) -> jax.Array | float:
+    return sum((x * y for x, y in zip(a, b, strict=False)), start=0.0)
 
 
 def _gospa(truths: Truths, tracks: Tracks, params: Params) -> dict[str, jax.Array]:
@@ -195,7 +210,7 @@ def _consistency(
     near = jnp.min(distances, axis=0) < params.gospa_cutoff
     error = jnp.where(near[:, None], truths.state[nearest] - tracks.mean, 0.0)
     covariance = jnp.where(near[:, None, None], tracks.covariance, jnp.eye(STATE_DIM))
-    value = jax.vmap(nees)(error, covariance)
+    value = nees(error, covariance)
     low, high = NEES_BAND
     return {
         "nees_sum": jnp.sum(jnp.where(near, value, 0.0)),

@@ -250,7 +250,7 @@ def test_nees_is_that_of_the_whole_matrix():
     covariance = root @ np.swapaxes(root, 1, 2) + np.diag([1.0, 10.0] * 3)
     error = 10 * rng.normal(size=(20, 6))
     expected = np.einsum("ti,ti->t", error, np.linalg.solve(covariance, error[..., None])[..., 0])
-    np.testing.assert_allclose(jax.vmap(nees)(error, covariance), expected, rtol=5e-3)
+    np.testing.assert_allclose(nees(error, covariance), expected, rtol=5e-3)
 
 
 def test_the_wait_is_counted_from_the_truths_first_step():
