@@ -12,7 +12,7 @@ from gymnax.environments import environment
 from jaxtrack import metrics, spaces, tracker
 from jaxtrack.association import MEASURES
 from jaxtrack.episode import EnvState, StepNoise, StepRecord, sample_step_noise
-from jaxtrack.kernel import Function, one_by_one
+from jaxtrack.kernel import Function, one_by_one, rarely
 from jaxtrack.observation import TRACK_FEATURES, Observation, observe
 from jaxtrack.params import Params, StaticParams, check_trajectories, validate
 from jaxtrack.reward import reward_terms
@@ -78,16 +78,21 @@ class SearchTrack(environment.Environment[EnvState, Params]):
         last, moved, reward, terminated, info = self.step_env(key_step, state, action, params)
         truncated = self.is_truncated(moved, params)
         done = terminated | truncated
-        truths = one_by_one_if_small(self._initiate_truths_if, self.static)(
-            done, key_reset, moved.truths, params
-        )
-        first = self._begin(key_reset, truths, params)
-        observation, state = jax.tree.map(lambda new, old: jnp.where(done, new, old), first, (last, moved))
+        observation, state = self._begin_again_if(done, key_reset, last, moved, params)
         ended = {"terminated": terminated, "truncated": truncated, "final_observation": last}
         return observation, state, reward, terminated, truncated, {**info, **ended}
 
-    def _initiate_truths_if(self, done: jax.Array, key: jax.Array, truths: Truths, params: Params) -> Truths:
-        return jax.lax.cond(done, lambda: initiate_truths(key, self.static, params), lambda: truths)
+    def _begin_again_if(
+        self, done: jax.Array, key: jax.Array, observation: Observation, state: EnvState, params: Params
+    ) -> tuple[Observation, EnvState]:
+        """A new episode if the old one is `done`."""
+
+        def begin(key: jax.Array, params: Params) -> tuple[Observation, EnvState]:
+            observation, state = self._begin(key, initiate_truths(key, self.static, params), params)
+            return _without_map(observation), state
+
+        observation, state = rarely(done, begin, (key, params), (_without_map(observation), state))
+        return {**observation, "scan_map": state.scan_map}, state
 
     def reset_env(self, key: jax.Array, params: Params) -> tuple[Observation, EnvState]:
         """New truths, no tracks, a field never seen."""
@@ -216,6 +221,11 @@ def step_info(
         "dropped_detections": record.num_dropped_detections,
         "dropped_tracks": record.num_dropped_tracks,
     }
+
+
+def _without_map(observation: Observation) -> Observation:
+    """The observation without the map, which is that of the state: it need not be carried twice."""
+    return {name: value for name, value in observation.items() if name != "scan_map"}
 
 
 def make(

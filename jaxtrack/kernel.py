@@ -49,11 +49,46 @@ def one_by_one(function: Function) -> Function:
 
             return jax.lax.map(one, [leaf for leaf, each in zip(leaves, varies, strict=True) if each])
 
-        # All arguments come back: XLA ends the process over one that it found to be of no use.
-        result, _ = jax.lax.optimization_barrier(_as_call(loop, _ONE_KERNEL)(*leaves))
+        # The next `jax.vmap` must not turn the branches in the loop into choices either. XLA ends the
+        # process over an argument that is a constant, and over one that it found to be of no use: hence
+        # the barriers, and all arguments come back.
+        in_one = _as_call(one_by_one(loop), _ONE_KERNEL)
+        result, _ = jax.lax.optimization_barrier(in_one(*jax.lax.optimization_barrier(leaves)))
         return result, jax.tree.map(lambda _: True, result)
 
     return looped
+
+
+def rarely(needed: jax.Array, function: Function, arguments: tuple[Any, ...], otherwise: Any) -> Any:
+    """``function(*arguments)`` where `needed` `[]`, else `otherwise`, a pytree of the same arrays.
+
+    Under `jax.vmap` on a CPU nothing is computed, nor gone through, as long as no row needs it.
+    """
+
+    def choose(needed: jax.Array, arguments: tuple[Any, ...], otherwise: Any) -> Any:
+        return jax.lax.cond(needed, lambda: function(*arguments), lambda: otherwise)
+
+    if jax.default_backend() != "cpu":
+        return choose(needed, arguments, otherwise)
+    chooser = custom_vmap(choose)
+
+    @chooser.def_vmap
+    def if_any(size: int, batched: list[Any], *values: Any) -> tuple[Any, Any]:
+        needed, arguments, otherwise = values
+        otherwise = jax.tree.map(
+            lambda leaf, has_rows: leaf if has_rows else jnp.broadcast_to(leaf, (size, *jnp.shape(leaf))),
+            otherwise,
+            batched[2],
+        )
+        rows = jax.tree.map(lambda has_rows: 0 if has_rows else None, tuple(batched[:2]))
+        result = jax.lax.cond(
+            jnp.any(needed),
+            lambda: jax.vmap(choose, in_axes=(*rows, 0))(needed, arguments, otherwise),
+            lambda: otherwise,
+        )
+        return result, jax.tree.map(lambda _: True, result)
+
+    return chooser(needed, arguments, otherwise)
 
 
 def stage(function: Function) -> Function:

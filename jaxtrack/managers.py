@@ -51,7 +51,9 @@ def greedy(
 
     def policy(key: jax.Array, state: "EnvState") -> jax.Array:
         del key
-        return to_action(first_largest(expected_rewards(state, looks, pixels, static, params)), static, params)
+        return to_action(
+            first_largest(expected_rewards(state, looks, pixels, static, params)), static, params
+        )
 
     return policy
 

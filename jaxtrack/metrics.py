@@ -194,15 +194,21 @@ def begins(tracks: Tracks) -> jax.Array:
 
     A slot may hold one track after another: they differ in birth step or birth detection.
     """
+    return one_by_one(_begins)(tracks.active, tracks.birth_step, tracks.birth_detection)
 
+
+def _begins(*rows: jax.Array) -> jax.Array:
     def one_step(last: tuple[jax.Array, ...], now: tuple[jax.Array, ...]) -> tuple[Any, jax.Array]:
         used, birth_step, birth_detection = last
         active, step, detection = now
         begun = active & (~used | (step != birth_step) | (detection != birth_detection))
-        last = used | active, jnp.where(active, step, birth_step), jnp.where(active, detection, birth_detection)
+        last = (
+            used | active,
+            jnp.where(active, step, birth_step),
+            jnp.where(active, detection, birth_detection),
+        )
         return last, begun
 
-    rows = tracks.active, tracks.birth_step, tracks.birth_detection
     return jax.lax.scan(one_step, tuple(jnp.zeros_like(row[0]) for row in rows), rows)[1]
 
 

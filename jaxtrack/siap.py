@@ -20,6 +20,9 @@ from jaxtrack.params import Params
 from jaxtrack.track_to_truth import Stretch, associate_tracks_to_truths
 from jaxtrack.types import Tracks, Truths, position, velocity
 
+LARGEST_IN_ONE_KERNEL = 1000
+"""Pairs of truth and track slot. Records with more are gone through together: sums over so many are
+not for one kernel."""
 _NEVER = -1
 
 
@@ -77,8 +80,9 @@ def siap(truths: Truths, tracks: Tracks, times: jax.Array, params: Params) -> Si
         params: numbers of the metric.
     """
     durations = jnp.diff(times, append=times[-1:])  # nothing comes after the last step
-    # Step by step, every array is small: as one kernel for each record in turn, many times faster.
-    counts, followed_times, longest, changes = one_by_one(_over_record)(truths, tracks, durations, params)
+    pairs = truths.alive.shape[1] * tracks.active.shape[1]
+    over_record = one_by_one(_over_record) if pairs <= LARGEST_IN_ONE_KERNEL else _over_record
+    counts, followed_times, longest, changes = over_record(truths, tracks, durations, params)
     return Siap(
         **vars(_ratios(*(jnp.sum(count) for count in counts))),
         track_change_rate=_quotient(jnp.sum(changes), jnp.sum(followed_times)),

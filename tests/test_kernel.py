@@ -53,7 +53,37 @@ def test_it_is_one_kernel():
     assert " while(" not in entry
 
 
-def test_a_step_of_the_environment_is_one_kernel_and_the_new_truths_another(static):
+def doubled_where_positive(x, otherwise):
+    return kernel.rarely(x.sum() > 0, lambda x: 2 * x, (x,), otherwise)
+
+
+@pytest.mark.parametrize("shift", [0.0, 9.0, -9.0])
+def test_rarely_is_a_choice_row_by_row_whether_some_all_or_no_row_needs_it(shift):
+    x = rows(7, 5) + shift
+    needed = x.sum(axis=1, keepdims=True) > 0
+    assert bool(needed.any()) == (shift >= 0)
+    assert bool(needed.all()) == (shift > 0)
+    for otherwise, in_axes in ((rows(7, 5) - 1, (0, 0)), (jnp.arange(5.0), (0, None))):
+        found = jax.jit(jax.vmap(doubled_where_positive, in_axes))(x, otherwise)
+        np.testing.assert_array_equal(found, jnp.where(needed, 2 * x, otherwise))
+    np.testing.assert_array_equal(doubled_where_positive(x[0], x[1]), 2 * x[0] if needed[0] else x[1])
+
+
+def test_rarely_computes_nothing_as_long_as_no_row_needs_it():
+    seen = []
+
+    def noted(x):
+        jax.debug.callback(lambda: seen.append(1))
+        return 2 * x
+
+    together = jax.jit(jax.vmap(lambda x: kernel.rarely(x.sum() > 0, noted, (x,), x)))
+    for x, needed in ((-jnp.ones((3, 2)), False), (jnp.ones((3, 2)).at[0].set(-1), True)):
+        jax.block_until_ready(together(x))
+        jax.effects_barrier()
+        assert bool(seen) == needed
+
+
+def test_a_step_of_the_environment_is_one_kernel_and_so_is_the_split_of_its_key(static):
     env, params = make(static=static)
     keys, action = jax.random.split(jax.random.key(0), 3), jnp.zeros(2, dtype=int)
     states = jax.eval_shape(jax.vmap(env.reset_env, in_axes=(0, None)), keys, params)[1]
@@ -81,6 +111,21 @@ def test_arguments_of_no_use_are_harmless():
 def test_constants_are_harmless():
     found = jax.jit(lambda: jax.vmap(kernel.one_by_one(branching), in_axes=(0, None))(rows(7, 5), SCALE))()
     np.testing.assert_allclose(found["row"], jax.vmap(branching, in_axes=(0, None))(rows(7, 5), SCALE)["row"])
+
+
+def test_constants_made_inside_are_harmless():
+    """XLA ended the process over an argument that was worked out to a constant."""
+
+    def drawn(x):
+        return kernel.one_by_one(lambda x, key: jax.random.uniform(key) + x)(x, jax.random.key(3))
+
+    found = jax.jit(jax.vmap(drawn))(jnp.zeros(4))
+    np.testing.assert_allclose(found, jnp.full(4, jax.random.uniform(jax.random.key(3))), rtol=1e-6)
+
+
+def test_batches_of_batches_keep_their_branches():
+    both = jax.vmap(jax.vmap(kernel.one_by_one(branching), in_axes=(0, None)), in_axes=(0, None))
+    assert " conditional(" in compiled_text(both, rows(3, 4, 5), SCALE)
 
 
 def test_a_stage_changes_nothing():

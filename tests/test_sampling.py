@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from jaxtrack.sampling import draw, matches, places, poisson_quantile
+from jaxtrack.sampling import draw, draw_index, first_largest, matches, places, poisson_quantile, split
 
 
 @pytest.mark.parametrize("largest", [0, 1, 5])
@@ -35,6 +35,33 @@ def test_draws_depend_on_the_key_and_on_nothing_else():
 
 def test_draws_have_the_precision_asked_for(x64):
     assert [numbers.dtype for numbers in draw(jax.random.key(0), 2, 2)] == [jnp.float64] * 2
+
+
+def test_a_split_is_that_of_jax_also_of_many_keys():
+    keys = jax.random.split(jax.random.key(2), 3)
+    first, second = jax.jit(jax.vmap(split))(keys)
+    expected = jax.vmap(jax.random.split)(keys)
+    assert jnp.all(first == expected[:, 0])
+    assert jnp.all(second == expected[:, 1])
+
+
+def test_an_index_is_uniform_and_another_one_at_every_time():
+    drawn = jax.jit(jax.vmap(lambda time: draw_index(jax.random.key(3), time, 5)))(jnp.arange(4000))
+    counts = np.bincount(drawn, minlength=5)
+    assert len(counts) == 5
+    assert stats.chisquare(counts).pvalue > 0.01
+
+
+@pytest.mark.parametrize(
+    ("values", "expected"),
+    [([1, 3, 2], 1), ([2, 5, 5], 1), ([-np.inf, -np.inf], 0), ([-4.0], 0), ([0.0, -0.0, np.inf], 2)],
+)
+def test_the_first_of_the_largest(values, expected):
+    assert int(first_largest(jnp.asarray(values, dtype=float))) == expected
+
+
+def test_a_nan_still_gives_a_row():
+    assert int(first_largest(jnp.array([1.0, jnp.nan, 3.0]))) == 0
 
 
 def test_places_count_the_chosen_before():

@@ -212,3 +212,21 @@ def test_a_record_of_one_step_is_allowed():
     truths, tracks = jax.tree.map(lambda leaf: leaf[:1], (truths_of(), tracks_of("A")))
     result = siap_of(truths, tracks, TIMES[:1], PARAMS)
     np.testing.assert_allclose([result.completeness, result.spuriousness], [0.0, 1.0])
+
+
+def test_records_together_are_judged_as_alone_however_large(monkeypatch):
+    truths, tracks = truths_of(lives_of_b=(3, 12)), tracks_of("AAABABABB", "  AAAA.AAAA")
+    both = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf[:, ::-1]]), (truths, tracks))
+    for largest in (1000, 5):
+        monkeypatch.setattr("jaxtrack.siap.LARGEST_IN_ONE_KERNEL", largest)
+        together = jax.jit(jax.vmap(siap, in_axes=(0, 0, None, None)))(*both, TIMES, PARAMS)
+        for i in range(2):
+            alone = siap_of(*jax.tree.map(lambda leaf, i=i: leaf[i], both), TIMES, PARAMS)
+            jax.tree.map(lambda a, b, i=i: np.testing.assert_allclose(a[i], b, rtol=1e-6), together, alone)
+
+
+def test_a_step_without_the_truth_has_no_error():
+    there = truths_of()
+    gone = Truths(there.state.at[3, 0].set(1e6), there.alive.at[3, 0].set(False))
+    result = totals("AAAAAA", truths=gone)
+    np.testing.assert_allclose(result.at_times.position_accuracy[:6], [OFFSET] * 3 + [0] + [OFFSET] * 2)

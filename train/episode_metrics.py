@@ -176,11 +176,12 @@ def nees(error: jax.Array, covariance: jax.Array) -> jax.Array:
         row.append(jnp.sqrt(covariance[..., i, i] - _dot(row, row)))
         white.append((error[..., i] - _dot(row, white)) / row[i])
         factor.append(row)
-    return sum(part**2 for part in white)
+    return _dot(white, white)
 
 
-def _dot(a: list[jax.Array], b: list[jax.Array]) -> jax.Array | float:
-    return sum((x * y for x, y in zip(a, b, strict=False)), start=0.0)
+def _dot(a: list[jax.Array], b: list[jax.Array]) -> jax.Array:
+    """Of as many entries as both have."""
+    return sum((x * y for x, y in zip(a, b, strict=False)), start=jnp.zeros(()))
 
 
 def _gospa(truths: Truths, tracks: Tracks, params: Params) -> dict[str, jax.Array]:
