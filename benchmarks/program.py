@@ -66,7 +66,7 @@ class Counts:
 def count(lowered: Lowered) -> Counts:
     """Compiles a program and counts."""
     compiled = lowered.compile()
-    text = compiled.as_text()
+    text = compiled.as_text() or ""
     entry = text[text.index("\nENTRY") :]
     cost = cost_of(compiled)
     return Counts(
