@@ -75,11 +75,12 @@ class Ours:
     def time(self, place: int, min_seconds: float) -> tuple[float, float]:
         """Seconds for one scenario by itself, and for one of a batch."""
         one, size = jax.block_until_ready(self.scene(place)), self.few.own.shape[0]
-        alone = _mean_seconds(lambda: self.one(one, self.params), min_seconds)
-        return alone, _mean_seconds(lambda: self.all(self.few, self.params), min_seconds) / size
+        alone = mean_seconds(lambda: self.one(one, self.params), min_seconds)
+        return alone, mean_seconds(lambda: self.all(self.few, self.params), min_seconds) / size
 
 
-def _mean_seconds(call: Callable[[], Any], min_seconds: float) -> float:
+def mean_seconds(call: Callable[[], Any], min_seconds: float) -> float:
+    """Seconds of one call, which is made again and again for at least so long (s)."""
     calls, began = 0, time.perf_counter()
     while (seconds := time.perf_counter() - began) < min_seconds or not calls:
         jax.block_until_ready(call())
