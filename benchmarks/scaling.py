@@ -26,8 +26,8 @@ from jaxtrack.params import Params, StaticParams
 from jaxtrack.report import circumstances, print_table, spread
 
 FIGURES = (".png", ".svg", ".pdf")
-WARM_UP = 3
-"""Calls that find the tracks, from the start of an episode."""
+WARM_UP = 2
+"""Looks at every truth, from the start of an episode, before anything is timed: they make the tracks."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -83,7 +83,7 @@ def check(options: ScalingOptions, params: Params) -> None:
         require_integer(name, max(values), low, LARGEST_IN_ONE_KERNEL.get(name))
     for name, low in (("repeats", 1), ("seed", 0)):
         require_integer(name, getattr(options, name), low)
-    require_integer("steps", options.steps, 1, params.max_steps_in_episode // (WARM_UP + 1))
+    require_integer("steps", options.steps, 1, params.max_steps_in_episode // 4)
     if not 0 < options.min_seconds < np.inf:
         raise ValueError(f"min_seconds = {options.min_seconds}: expected a number > 0")
     for name in ("out", "figure"):
@@ -122,7 +122,7 @@ class Program:
         self.compiled, self.compile_seconds = compile_play(
             env, self.params, start, pointing, options.steps, shared=case.devices > 1
         )
-        for _ in range(WARM_UP):
+        for _ in range(-(-WARM_UP * case.static.num_truths // options.steps)):
             start, logged = self.compiled(self.keys, start, self.params)
         self.start, self.live_tracks = start, float(logged["live_tracks"].mean())
 

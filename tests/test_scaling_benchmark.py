@@ -19,7 +19,7 @@ pytestmark = pytest.mark.usefixtures("quick_compilation")
 STATIC = StaticParams(num_truths=3, max_tracks=4, max_detections=3, max_clutter=2, map_size=8, num_looks=5)
 PARAMS = Params(beam_azimuth=0.7, beam_elevation=0.7)
 DEFAULT = ScalingOptions()
-OPTIONS = ScalingOptions(num_envs=(2, 4), repeats=2, steps=5, min_seconds=0.001)
+OPTIONS = ScalingOptions(num_envs=(2, 4), repeats=2, steps=2, min_seconds=0.001)
 
 
 def rows_of(costs):
