@@ -16,7 +16,7 @@ from stonesoup.metricgenerator.base import MetricGenerator
 from stonesoup.metricgenerator.manager import MultiManager
 
 from benchmarks.operations import mean_seconds
-from benchmarks.planning import written
+from benchmarks.planning import with_spread, written
 from jaxtrack import policies
 from jaxtrack.cli import parse, require_file, require_integer, run, wide_console
 from jaxtrack.env import make
@@ -209,10 +209,7 @@ def cells(row: dict[str, Any]) -> list[str]:
     """The row under `HEADER`; the ratios are to ours alone / in a batch."""
     return [
         row["metric"],
-        *(
-            "{} ({} - {})".format(*(written(row["milliseconds"][side][w]) for w in ("median", "min", "max")))
-            for side in ("alone", "batch", "stone_soup")
-        ),
+        *(with_spread(row["milliseconds"][side]) for side in ("alone", "batch", "stone_soup")),
         " / ".join(written(row["ratios"][side]) for side in ("alone", "batch")),
         f"{row['values']:,}",
         f"{row['largest_difference']:.1e}",

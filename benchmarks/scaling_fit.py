@@ -71,6 +71,8 @@ def draw(rows: Sequence[dict[str, Any]], path: Path, note: str) -> None:
     for place, row in enumerate(rows, start=1):
         panel = figure.add_subplot(-(-len(rows) // columns), columns, place)
         draw_panel(panel, row, axes[row["axis"]])
+    handles, labels = figure.axes[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside upper center", ncols=2, frameon=False)
     figure.supxlabel(note, fontsize=8)
     figure.savefig(path, dpi=110)
 
@@ -83,7 +85,7 @@ def draw_panel(panel: Any, row: dict[str, Any], axis: Axis) -> None:
     if row["fit"]:
         fine = np.geomspace(values.min(), values.max(), 50)
         line = row["fit"]["fixed"] + row["fit"]["one_more"] * fine**axis.power
-        panel.plot(fine, line, color="0.5", linestyle="--", label="straight line in the number of units")
+        panel.plot(fine, line, color="0.5", linestyle="--", label="fixed cost + number x cost of one more")
     panel.errorbar(
         values, median, yerr=[median - low, high - median], color="black", marker="o", linestyle="none",
         capsize=3, label="median, smallest, largest",
@@ -92,9 +94,9 @@ def draw_panel(panel: Any, row: dict[str, Any], axis: Axis) -> None:
         panel.set_xscale("log")
         panel.set_yscale("log")
     else:
-        panel.set_ylim(bottom=0)
-        panel.set_xticks(values)
+        panel.set_ylim(0, 1.6 * median.max())  # a disturbed repeat must not hide the others
     panel.set_xlabel(axis.label)
     panel.set_ylabel("µs per step of all" if axis.per_step_of_all else "µs per step of one environment")
+    if not axis.line:
+        panel.set_xticks(values)
     panel.grid(color="0.9")
-    panel.legend(fontsize=7, loc="upper left" if axis.line else "lower left")

@@ -3,6 +3,7 @@
 import dataclasses
 import json
 from collections.abc import Callable, Sequence
+from importlib.metadata import version
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,7 @@ from rich.progress import Progress
 
 from benchmarks.operations import OPERATIONS, Ours
 from benchmarks.peers import FilterPy, StoneSoup, has_filterpy
-from benchmarks.planning import written
+from benchmarks.planning import with_spread, written
 from benchmarks.scene import Scene, Timed, error, random_scenes
 from jaxtrack.cli import parse, require_file, require_integer, run, wide_console
 from jaxtrack.env import LARGEST_IN_ONE_KERNEL
@@ -54,8 +55,8 @@ def check(options: TrackerOptions) -> None:
     if len(set(options.tracks)) < len(options.tracks) or not options.tracks:
         raise ValueError(f"tracks = {options.tracks}: expected different numbers")
     require_integer("detections", options.detections, 1)
-    require_integer("tracks", min(options.tracks), options.detections)
-    require_integer("tracks", max(options.tracks), options.detections, LARGEST_IN_ONE_KERNEL["max_tracks"])
+    for number in (min(options.tracks), max(options.tracks)):
+        require_integer("tracks", number, options.detections, LARGEST_IN_ONE_KERNEL["max_tracks"])
     require_integer("batch", options.batch, 2)
     require_integer("repeats", options.repeats, 1)
     require_integer("seed", options.seed, 0)
@@ -160,9 +161,7 @@ def cells(row: dict[str, Any], with_filterpy: bool) -> list[str]:
     """The row under `header`; ratios are to ours alone / in a batch."""
 
     def speed(side: str) -> str:
-        values = row["microseconds"].get(side)
-        shown = [written(values[which]) for which in ("median", "min", "max")] if values else []
-        return "{} ({} - {})".format(*shown) if shown else ""
+        return with_spread(row["microseconds"][side]) if side in row["microseconds"] else ""
 
     def ratio(side: str) -> str:
         both = [row["ratios"].get(f"{side} / {own}") for own in ("alone", "batch")]
@@ -195,6 +194,8 @@ def main(argv: Sequence[str]) -> int:
     )
     print_table(header(rows), [cells(row, with_filterpy) for row in rows], title, options.markdown, console)
     if options.out is not None:
+        if with_filterpy:
+            report["versions"]["filterpy"] = version("filterpy")
         report["options"] = {k: v for k, v in vars(options).items() if k not in ("out", "markdown")}
         report["scenario"] = vars(params)
         found = {"largest_difference_sigma": largest, "rows": rows}

@@ -100,6 +100,7 @@ def test_command_writes_all_and_prints_markdown(rows, tmp_path, monkeypatch, cap
     result = json.loads(file.read_text())
     assert {"date", "versions", "machine", "options", "scenario", "rows"} < set(result)
     assert result["rows"] == rows
+    assert ("filterpy" in result["versions"]) == peers.has_filterpy()
     assert result["options"]["tracks"] == [7]
     assert str(tmp_path) not in file.read_text()
     said = capsys.readouterr().out
@@ -134,7 +135,7 @@ def test_without_filterpy_its_columns_are_left_out(monkeypatch, capsys):
     [
         (["--repeats", "0"], "repeats = 0"),
         (["--tracks", "5", "5"], r"tracks = \(5, 5\): expected different"),
-        (["--tracks", "4"], r"tracks = 4: expected an integer >= 5"),
+        (["--tracks", "4"], r"tracks = 4: expected an integer in \[5, 200\]"),
         (["--tracks", "201"], r"tracks = 201: expected an integer in \[5, 200\]"),
         (["--detections", "0"], "detections = 0"),
         (["--batch", "1"], "batch = 1"),
