@@ -81,20 +81,20 @@ def draw_panel(panel: Any, row: dict[str, Any], axis: Axis) -> None:
     """One axis of the scenario; black and white are enough to read it."""
     values = np.array(row["values"], float)
     costs = row["microseconds"]
-    median, low, high = (np.array([cost[which] for cost in costs]) for which in ("median", "min", "max"))
+    low, median = (np.array([cost[which] for cost in costs]) for which in ("min", "median"))
     if row["fit"]:
         fine = np.geomspace(values.min(), values.max(), 50)
         line = row["fit"]["fixed"] + row["fit"]["one_more"] * fine**axis.power
         panel.plot(fine, line, color="0.5", linestyle="--", label="fixed cost + number x cost of one more")
     panel.errorbar(
-        values, median, yerr=[median - low, high - median], color="black", marker="o", linestyle="none",
-        capsize=3, label="median, smallest, largest",
+        values, low, yerr=[0 * low, median - low], color="black", marker="o", linestyle="none",
+        capsize=3, label="smallest of the repeats, and up to their median",
     )  # fmt: skip
     if axis.per_step_of_all:
         panel.set_xscale("log")
         panel.set_yscale("log")
     else:
-        panel.set_ylim(0, 1.6 * median.max())  # a disturbed repeat must not hide the others
+        panel.set_ylim(0, 1.6 * low.max())  # a disturbed case must not hide the others
     panel.set_xlabel(axis.label)
     panel.set_ylabel("µs per step of all" if axis.per_step_of_all else "µs per step of one environment")
     if not axis.line:

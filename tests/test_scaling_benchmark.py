@@ -23,13 +23,13 @@ OPTIONS = ScalingOptions(num_envs=(2, 4), repeats=2, steps=2, min_seconds=0.001)
 
 
 def rows_of(costs):
-    """What `measure` returns, with the given cost (µs per step of all) of every case."""
+    """What `measure` returns, with the given cost (µs per step of all), and two disturbed repeats."""
     programs, rows = {}, []
     for axis in AXES:
         cases = scaling.cases_along(axis, DEFAULT, StaticParams())
         for case in cases.values():
             programs[case] = SimpleNamespace(live_tracks=10.0, compile_seconds=5.0)
-        times = {case: [costs(case)] * 3 for case in cases.values()}
+        times = {case: [3 * costs(case), costs(case), 2 * costs(case)] for case in cases.values()}
         rows.append(scaling.make_row(axis, cases, times, programs))
     return rows
 
