@@ -201,13 +201,18 @@ def written(speed: float) -> str:
     return f"{speed:,.0f}" if speed >= 100 else f"{speed:#.3g}"
 
 
+def with_spread(speed: dict[str, Any]) -> str:
+    """Median (smallest - largest) of `report.spread`."""
+    return "{} ({} - {})".format(*(written(speed[which]) for which in ("median", "min", "max")))
+
+
 def cells(row: dict[str, Any]) -> list[str]:
     """The row under `HEADER`."""
     speed, seconds = row["decisions_per_second"], row["compile_seconds"]
     return [
         row["manager"],
         str(row["num_states"]),
-        "{} ({} - {})".format(*(written(speed[which]) for which in ("median", "min", "max"))),
+        with_spread(speed),
         f"{row['ratio']:,.0f}",
         "" if seconds is None else f"{seconds:.1f} s",
     ]

@@ -67,18 +67,25 @@ def raster(key: jax.Array, params: Params, env: SearchTrack, num_envs: int) -> S
 
 
 def compile_play(
-    env: SearchTrack, params: Params, start: Start, build: policies.PolicyBuilder, steps: int
+    env: SearchTrack,
+    params: Params,
+    start: Start,
+    build: policies.PolicyBuilder,
+    steps: int,
+    shared: bool = True,
 ) -> tuple[Any, float]:
     """The compiled `play` on all cores, called once to warm up, and the seconds that compiling took.
 
-    One environment, or a number that the cores can not share equally, is played on one core.
+    One environment, or a number that the cores can not share equally, is played on one core, and so
+    is everything that is not to be `shared`.
     """
 
     def function(keys: jax.Array, start: Start, params: Params) -> tuple[Start, dict[str, jax.Array]]:
         return play(keys, start, params, env, build, steps)
 
     num_envs = start[1].time.shape[0]
-    on_all = function if num_envs % jax.device_count() else cores.share_out(function, shared=1)
+    on_one = not shared or num_envs % jax.device_count()
+    on_all = function if on_one else cores.share_out(function, shared=1)
     keys = jax.random.split(jax.random.key(0), num_envs)
     began = time.perf_counter()
     compiled = jax.jit(on_all).lower(keys, start, params).compile()

@@ -105,6 +105,25 @@ def test_ours_counts_every_step_of_every_environment(monkeypatch):
     assert timing == environment.Timing(steps_per_second=18.0, detections=0.5, live_tracks=2.0)
 
 
+@pytest.mark.parametrize(
+    ("num_envs", "shared", "expected"), [(4, True, [1]), (4, False, []), (3, True, []), (1, True, [])]
+)
+def test_environments_are_shared_out_where_they_can_and_may_be(monkeypatch, num_envs, shared, expected):
+    asked = []
+
+    def share_out(function, shared):
+        asked.append(shared)
+        return function
+
+    monkeypatch.setattr(playing.cores, "share_out", share_out)
+    monkeypatch.setattr(jax, "device_count", lambda: 2)
+    monkeypatch.setattr(playing, "play", lambda keys, start, *_: (start, {}))
+    env, params = make(PARAMS, STATIC)
+    start = jax.vmap(env.reset, in_axes=(0, None))(jax.random.split(jax.random.key(0), num_envs), params)
+    playing.compile_play(env, params, start, playing.pointing, 3, shared=shared)
+    assert asked == expected
+
+
 def test_command_writes_all_and_prints_markdown(rows, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(environment, "measure", lambda *_: rows)
     file = tmp_path / "result.json"
