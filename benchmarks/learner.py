@@ -96,7 +96,7 @@ def load_stable_baselines3() -> ModuleType:
 def configure(encoder: str, options: LearnerOptions) -> TrainConfig:
     """The configuration of both learners; what is not an option is a default of `train.ppo`."""
     samples = options.num_envs * options.rollout_steps
-    config = TrainConfig(
+    return TrainConfig(
         encoder=encoder,
         num_envs=options.num_envs,
         rollout_steps=options.rollout_steps,
@@ -108,7 +108,6 @@ def configure(encoder: str, options: LearnerOptions) -> TrainConfig:
         static=StaticParams(),
         params=Params(),
     )
-    return dataclasses.replace(config, microbatch=min(config.microbatch, config.minibatch_size))
 
 
 def build_ours(config: TrainConfig, live_tracks: int) -> tuple[Update, dict[str, Any], float]:
