@@ -112,7 +112,7 @@ def configure(encoder: str, options: LearnerOptions) -> TrainConfig:
 
 def build_ours(config: TrainConfig, live_tracks: int) -> tuple[Update, dict[str, Any], float]:
     """Our learner, the observations that it sees, and the seconds that compiling its update took."""
-    env = StillWorld(config.static, live_tracks)
+    env: Any = StillWorld(config.static, live_tracks)
     init = jax.jit(lambda key, params: learner.init_learner(key, params, env, config))
     state = init(jax.random.key(config.seed), config.params)
     observations = jax.device_get(state.env.observation)

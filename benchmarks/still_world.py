@@ -1,5 +1,7 @@
 """An environment that costs nothing, to time a learner alone."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 from flax import struct
@@ -8,7 +10,7 @@ from jaxtrack.observation import TRACK_FEATURES, Observation
 from jaxtrack.params import Params, StaticParams
 from train.learner import LOGGED
 
-Step = tuple[Observation, "StillState", jax.Array, jax.Array, jax.Array, dict[str, jax.Array]]
+Step = tuple[Observation, "StillState", jax.Array, jax.Array, jax.Array, dict[str, Any]]
 
 
 class StillState(struct.PyTreeNode):

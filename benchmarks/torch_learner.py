@@ -118,7 +118,7 @@ class StillVecEnv(VecEnv):
     """
 
     def __init__(self, observations: Arrays, num_looks: int) -> None:
-        boxes = {
+        boxes: dict[str, gymnasium.spaces.Space[Any]] = {
             name: gymnasium.spaces.Box(-1.0, 1.0, values.shape[1:], np.float32)
             for name, values in observations.items()
         }

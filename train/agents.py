@@ -19,6 +19,10 @@ AGENTS = ("beams", *ENCODERS)
 """Names of the policies that can be trained: the beam policy, then the paper's three."""
 
 
+SHARES = (4, 2, 1)
+"""Track lists of T slots are cut to T / share; what is done with them is compiled for each length."""
+
+
 class TrackLists(NamedTuple):
     """How to leave out the empty slots at the end of track lists, which change no result.
 
@@ -31,6 +35,13 @@ class TrackLists(NamedTuple):
     slots: int
     used: Callable[[Any], jax.Array]
     cut: Callable[[Any, int], Any]
+
+    def apply(self, function: Callable[[Any], Any], inputs: Any) -> Any:
+        """`function` of batched inputs, their lists cut to the first length into which all fit."""
+        lengths = sorted({-(-self.slots // share) for share in SHARES})
+        fits = jnp.searchsorted(jnp.asarray(lengths), jnp.max(self.used(inputs)))
+        branches = [lambda length=length: function(self.cut(inputs, length)) for length in lengths]
+        return jax.lax.switch(fits, branches)
 
 
 class Agent(NamedTuple):
@@ -52,6 +63,15 @@ class Agent(NamedTuple):
         """Logits and value of batched inputs."""
         result: Any = self.network.apply(weights, inputs)
         return result
+
+    def evaluate_quickly(self, weights: Any, inputs: Any) -> tuple[jax.Array, jax.Array]:
+        """The same, but for rounding, with the lists cut; not to be differentiated."""
+        result: Any = self.on_short_lists(lambda cut: self.evaluate(weights, cut), inputs)
+        return result
+
+    def on_short_lists(self, function: Callable[[Any], Any], inputs: Any) -> Any:
+        """`function` of batched inputs without the slots that are empty in all of them, where that helps."""
+        return self.lists.apply(function, inputs) if self.lists else function(inputs)
 
 
 def build_agent(name: str, static: StaticParams, params: Params) -> Agent:

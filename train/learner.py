@@ -133,7 +133,7 @@ def collect(
 
     def one_step(carry: LearnerState, key: jax.Array) -> tuple[LearnerState, tuple[Transition, Any, Any]]:
         key_action, key_env = jax.random.split(key)
-        logits, value = agent.evaluate(carry.weights, carry.inputs)
+        logits, value = agent.evaluate_quickly(carry.weights, carry.inputs)
         action = choose(key_action, carry.env, logits)
         keys = jax.random.split(key_env, config.num_envs)
         observation, env_state, reward, terminated, truncated, info = jax.vmap(

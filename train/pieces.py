@@ -13,9 +13,6 @@ from train.agents import Agent
 from train.config import TrainConfig
 from train.loss import Sample, ppo_loss
 
-SHARES = (4, 2, 1)
-"""Lists are cut to T / share slots; each length is compiled for itself."""
-
 
 def shortest_first(rows: jax.Array, inputs: Any, agent: Agent) -> jax.Array:
     """The rows `[M]` of a minibatch in order of their lists' lengths, where that is of use.
@@ -43,12 +40,13 @@ def minibatch_gradient(
         (minibatch, normalised, target),
     )
 
-    def add_piece(total: Any, piece: Any) -> tuple[Any, None]:
-        return jax.tree.map(jnp.add, total, piece_gradient(weights, *piece, agent, config)), None
+    def gradient(piece: tuple[Sample, jax.Array, jax.Array]) -> Any:
+        return piece_gradient(weights, *piece, agent, config)
 
-    shapes = jax.eval_shape(
-        lambda piece: piece_gradient(weights, *piece, agent, config), jax.tree.map(lambda x: x[0], split)
-    )
+    def add_piece(total: Any, piece: Any) -> tuple[Any, None]:
+        return jax.tree.map(jnp.add, total, gradient(piece)), None
+
+    shapes = jax.eval_shape(gradient, jax.tree.map(lambda leaf: leaf[0], split))
     zeros = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
     total, _ = jax.lax.scan(add_piece, zeros, split)
     return jax.tree.map(lambda leaf: leaf / pieces, total)
@@ -58,21 +56,11 @@ def piece_gradient(
     weights: Any, samples: Sample, advantage: jax.Array, target: jax.Array, agent: Agent, config: TrainConfig
 ) -> tuple[Any, dict[str, jax.Array]]:
     """Gradient of the loss over a piece, with its track lists as short as they may be cut."""
-    gradient = jax.grad(ppo_loss, has_aux=True)
-    lists = agent.lists
-    if lists is None:
-        result: Any = gradient(weights, samples, advantage, target, agent, config)
-        return result
-    lengths = sorted({-(-lists.slots // share) for share in SHARES})
 
-    def with_length(length: int) -> Any:
-        def cut_gradient() -> Any:
-            cut = samples.replace(inputs=lists.cut(samples.inputs, length))
-            return gradient(weights, cut, advantage, target, agent, config)
+    def gradient(inputs: Any) -> Any:
+        short = samples.replace(inputs=inputs)
+        return jax.grad(ppo_loss, has_aux=True)(weights, short, advantage, target, agent, config)
 
-        return cut_gradient
-
-    # The first length into which all lists of the piece fit.
-    fits = jnp.searchsorted(jnp.asarray(lengths), jnp.max(lists.used(samples.inputs)))
-    result = jax.lax.switch(fits, [with_length(length) for length in lengths])
+    # Outside the gradient: inside, every branch would fill in what the others keep for the way back.
+    result: Any = agent.on_short_lists(gradient, samples.inputs)
     return result
