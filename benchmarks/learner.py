@@ -42,8 +42,8 @@ class LearnerOptions:
     """Samples per optimiser step."""
     epochs: int = 4
     """Passes over the samples of an update."""
-    live_tracks: int = 10
-    """Most live tracks of the 20 slots; each observation holds 0 to so many."""
+    live_tracks: tuple[int, int] = (5, 10)
+    """Fewest and most live tracks in an observation of 20 slots; in between, all are equally frequent."""
     repeats: int = 5
     """Times that everything is timed."""
     seed: int = 0
@@ -62,7 +62,11 @@ def check(options: LearnerOptions) -> None:
     """Raises ValueError, naming the option, before anything is measured."""
     for name in ("num_envs", "rollout_steps", "minibatch_size", "epochs", "repeats"):
         require_integer(name, getattr(options, name), 1)
-    require_integer("live_tracks", options.live_tracks, 0, StaticParams().max_tracks)
+    fewest, most = options.live_tracks
+    if not 0 <= fewest <= most <= (slots := StaticParams().max_tracks):
+        raise ValueError(
+            f"live_tracks = {options.live_tracks}: expected two integers in order in [0, {slots}]"
+        )
     require_integer("seed", options.seed, 0)
     known = ", ".join(ENCODERS)
     if not options.encoders or len(set(options.encoders)) < len(options.encoders):
@@ -110,7 +114,7 @@ def configure(encoder: str, options: LearnerOptions) -> TrainConfig:
     )
 
 
-def build_ours(config: TrainConfig, live_tracks: int) -> tuple[Update, dict[str, Any], float]:
+def build_ours(config: TrainConfig, live_tracks: tuple[int, int]) -> tuple[Update, dict[str, Any], float]:
     """Our learner, the observations that it sees, and the seconds that compiling its update took."""
     env: Any = StillWorld(config.static, live_tracks)
     init = jax.jit(lambda key, params: learner.init_learner(key, params, env, config))

@@ -27,10 +27,10 @@ class StillWorld:
 
     Args:
         static: shapes.
-        live_tracks: most live tracks in an observation; each has 0 to so many, in its first slots.
+        live_tracks: fewest and most live tracks in an observation; they are in its first slots.
     """
 
-    def __init__(self, static: StaticParams, live_tracks: int) -> None:
+    def __init__(self, static: StaticParams, live_tracks: tuple[int, int]) -> None:
         self.static, self.live_tracks = static, live_tracks
 
     def reset_env(self, key: jax.Array, params: Params) -> tuple[Observation, StillState]:
@@ -48,14 +48,14 @@ class StillWorld:
         return state.observation, state.replace(time=state.time + 1), reward, never, never, info
 
 
-def random_observation(key: jax.Array, static: StaticParams, live_tracks: int) -> Observation:
+def random_observation(key: jax.Array, static: StaticParams, live_tracks: tuple[int, int]) -> Observation:
     """Random numbers in the shapes of the environment's observation, padded as there.
 
     Returns:
         `tracks` `[T, 7]`, `mask` `[T]` and `scan_map` `[M, M]`.
     """
     key_number, key_tracks, key_map = jax.random.split(key, 3)
-    number = jax.random.randint(key_number, (), 0, live_tracks + 1)
+    number = jax.random.randint(key_number, (), live_tracks[0], live_tracks[1] + 1)
     mask = jnp.arange(static.max_tracks) < number
     tracks = jax.random.uniform(key_tracks, (static.max_tracks, TRACK_FEATURES), minval=-1.0)
     scan_map = jax.random.uniform(key_map, (static.map_size, static.map_size))

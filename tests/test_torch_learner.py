@@ -20,7 +20,7 @@ each_encoder = pytest.mark.parametrize("encoder", ENCODERS)
 def observations():
     """Track lists of 0 to 20 tracks, an empty and a full one among them."""
     keys = jax.random.split(jax.random.key(0), OPTIONS.num_envs)
-    drawn = jax.vmap(lambda key: random_observation(key, StaticParams(), 20))(keys)
+    drawn = jax.vmap(lambda key: random_observation(key, StaticParams(), (0, 20)))(keys)
     arrays = {name: np.array(values) for name, values in drawn.items()}
     rng = np.random.default_rng(0)
     for row, length in enumerate((0, 20, 1)):

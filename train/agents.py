@@ -19,8 +19,9 @@ AGENTS = ("beams", *ENCODERS)
 """Names of the policies that can be trained: the beam policy, then the paper's three."""
 
 
-SHARES = (4, 2, 1)
-"""Track lists of T slots are cut to T / share; what is done with them is compiled for each length."""
+SHARES = (2, 1)
+"""Track lists of T slots are cut to T / share. What is done with them is compiled for each length, and in
+the paper's scenario a half is enough for whatever a policy tracks."""
 
 
 class TrackLists(NamedTuple):

@@ -18,7 +18,7 @@ pytestmark = pytest.mark.usefixtures("quick_compilation")
 STATIC = StaticParams(max_tracks=8, map_size=36, num_looks=5)
 CONFIG = TrainConfig(num_envs=4, rollout_steps=4, num_minibatches=1, microbatch=4, warm_start="none")
 USED = np.array([0, 1, 2, 2, 3, 4, 4, 4, 5, 8, 8, 0, 2, 6, 3, 8])
-"""Slots up to the last track: lengths 2, 4 and 8 are compiled, and all their edges are here."""
+"""Slots up to the last track: lengths 4 and 8 are compiled, and all their edges are here."""
 
 
 def observations():
@@ -67,7 +67,7 @@ def test_short_lists_change_neither_gradients_nor_outputs(draw_variables, encode
         )
 
     got, expected = outcome(weights, inputs)
-    assert set(lengths) == {2, 4, 8}
+    assert set(lengths) == {4, 8}
     for a, b in zip(*map(jax.tree.leaves, (got, expected)), strict=True):
         assert np.all(np.isfinite(b))
         np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5 * float(jnp.max(jnp.abs(b))))
@@ -79,7 +79,7 @@ def test_the_shortest_length_that_holds_all_lists_is_taken():
     taken = jax.jit(lambda row: agent.on_short_lists(lambda cut: jnp.asarray(cut["mask"].shape[1]), row))
     for row, used in enumerate(USED):
         one = jax.tree.map(lambda leaf, row=row: leaf[row : row + 1], inputs)
-        assert int(taken(one)) == next(length for length in (2, 4, 8) if used <= length)
+        assert int(taken(one)) == next(length for length in (4, 8) if used <= length)
 
 
 def test_samples_are_sorted_by_length_only_where_that_is_of_use():
