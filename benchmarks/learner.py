@@ -62,8 +62,8 @@ def check(options: LearnerOptions) -> None:
     """Raises ValueError, naming the option, before anything is measured."""
     for name in ("num_envs", "rollout_steps", "minibatch_size", "epochs", "repeats"):
         require_integer(name, getattr(options, name), 1)
-    fewest, most = options.live_tracks
-    if not 0 <= fewest <= most <= (slots := StaticParams().max_tracks):
+    (fewest, most), slots = options.live_tracks, StaticParams().max_tracks
+    if not 0 <= fewest <= most <= slots:
         raise ValueError(
             f"live_tracks = {options.live_tracks}: expected two integers in order in [0, {slots}]"
         )
