@@ -27,11 +27,11 @@ def spread(values: Sequence[float]) -> dict[str, Any]:
     }
 
 
-def circumstances() -> dict[str, Any]:
-    """Date, versions and machine; no names of hosts, users or folders."""
+def circumstances(packages: Sequence[str] = PACKAGES) -> dict[str, Any]:
+    """Date, versions of the packages, and machine; no names of hosts, users or folders."""
     return {
         "date": datetime.now(UTC).isoformat(timespec="seconds"),
-        "versions": {"python": platform.python_version(), **versions()},
+        "versions": {"python": platform.python_version(), **versions(packages)},
         "machine": {
             "processor": processor(),
             "cores": cores.available(),
@@ -41,10 +41,10 @@ def circumstances() -> dict[str, Any]:
     }
 
 
-def versions() -> dict[str, str]:
+def versions(packages: Sequence[str] = PACKAGES) -> dict[str, str]:
     """Versions of the packages that figures depend on, as far as they are installed."""
     found = {}
-    for name in PACKAGES:
+    for name in packages:
         try:
             found[name] = version(name)
         except PackageNotFoundError:

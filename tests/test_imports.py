@@ -38,6 +38,18 @@ def test_arrows_between_packages_point_one_way(folder, forbidden):
     assert not packages & forbidden
 
 
+def test_only_modules_for_stable_baselines3_import_it():
+    folders = ("jaxtrack", "reference", "train", "benchmarks")
+    paths = [path for folder in folders for path in sorted((ROOT / folder).rglob("*.py"))]
+    words = ("import torch", "from torch", "import stable_baselines3", "from stable_baselines3")
+    importing = {
+        str(path.relative_to(ROOT))
+        for path in paths
+        if any(line.strip().startswith(words) for line in path.read_text().splitlines())
+    }
+    assert importing == {"jaxtrack/sb3.py", "benchmarks/torch_learner.py"}
+
+
 def modules_after(statement):
     """Top-level modules loaded in a fresh interpreter by one statement."""
     code = f"{statement}; import sys; print(*{{name.split('.')[0] for name in sys.modules}})"

@@ -4,6 +4,7 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 from flax import linen as nn
 
 from jaxtrack.episode import EnvState
@@ -12,10 +13,36 @@ from jaxtrack.params import Params, StaticParams
 from jaxtrack.policies import Policy, PolicyBuilder
 from train.beams import BeamGeometry, BeamNetwork
 from train.distributions import FACTORED, JOINT, Distribution
-from train.networks import ENCODERS, PaperNetwork
+from train.networks import ANY_LENGTH, ENCODERS, PaperNetwork
 
 AGENTS = ("beams", *ENCODERS)
 """Names of the policies that can be trained: the beam policy, then the paper's three."""
+
+
+SHARES = (2, 1)
+"""Track lists of T slots are cut to T / share. What is done with them is compiled for each length, and in
+the paper's scenario a half is enough for whatever a policy tracks."""
+
+
+class TrackLists(NamedTuple):
+    """How to leave out the empty slots at the end of track lists, which change no result.
+
+    Attributes:
+        slots: number T of slots of a list.
+        used: batched inputs to the numbers `[B]` of slots up to the last track.
+        cut: batched inputs and a length to the same inputs with so many slots.
+    """
+
+    slots: int
+    used: Callable[[Any], jax.Array]
+    cut: Callable[[Any, int], Any]
+
+    def apply(self, function: Callable[[Any], Any], inputs: Any) -> Any:
+        """`function` of batched inputs, their lists cut to the first length into which all fit."""
+        lengths = sorted({-(-self.slots // share) for share in SHARES})
+        fits = jnp.searchsorted(jnp.asarray(lengths), jnp.max(self.used(inputs)))
+        branches = [lambda length=length: function(self.cut(inputs, length)) for length in lengths]
+        return jax.lax.switch(fits, branches)
 
 
 class Agent(NamedTuple):
@@ -25,16 +52,27 @@ class Agent(NamedTuple):
         features: one observation to network inputs; nothing in it is learned.
         network: batched inputs to (logits, value).
         distribution: of actions, given logits.
+        lists: where the network takes track lists of any length.
     """
 
     features: Callable[[Observation], Any]
     network: nn.Module
     distribution: Distribution
+    lists: TrackLists | None = None
 
     def evaluate(self, weights: Any, inputs: Any) -> tuple[jax.Array, jax.Array]:
         """Logits and value of batched inputs."""
         result: Any = self.network.apply(weights, inputs)
         return result
+
+    def evaluate_quickly(self, weights: Any, inputs: Any) -> tuple[jax.Array, jax.Array]:
+        """The same, but for rounding, with the lists cut; not to be differentiated."""
+        result: Any = self.on_short_lists(lambda cut: self.evaluate(weights, cut), inputs)
+        return result
+
+    def on_short_lists(self, function: Callable[[Any], Any], inputs: Any) -> Any:
+        """`function` of batched inputs without the slots that are empty in all of them, where that helps."""
+        return self.lists.apply(function, inputs) if self.lists else function(inputs)
 
 
 def build_agent(name: str, static: StaticParams, params: Params) -> Agent:
@@ -51,7 +89,20 @@ def build_agent(name: str, static: StaticParams, params: Params) -> Agent:
     if name == "beams":
         return Agent(BeamGeometry(static, params), BeamNetwork(), JOINT)
     network = PaperNetwork(encoder=name, num_looks=static.num_looks)
-    return Agent(lambda observation: observation, network, FACTORED)
+    lists = TrackLists(static.max_tracks, used_slots, cut_lists) if name in ANY_LENGTH else None
+    return Agent(lambda observation: observation, network, FACTORED, lists)
+
+
+def used_slots(observations: Observation) -> jax.Array:
+    """Slots `[B]` up to the last track of each observation."""
+    mask = observations["mask"]
+    return jnp.max(jnp.where(mask, jnp.arange(1, mask.shape[-1] + 1), 0), axis=-1)
+
+
+def cut_lists(observations: Observation, length: int) -> Observation:
+    """The observations with the first `length` slots of their track lists."""
+    mask, tracks = observations["mask"][:, :length], observations["tracks"][:, :length]
+    return {**observations, "mask": mask, "tracks": tracks}
 
 
 def agent_policy(name: str, weights: Any, greedy: bool = False) -> PolicyBuilder:

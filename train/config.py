@@ -14,6 +14,9 @@ from train.vision import SMALLEST_MAP
 
 NO_WARM_START = "none"
 
+PIECE_SIZES = {"beams": 128}
+"""Samples per piece of a gradient that suit an agent's network; 32 where nothing is said."""
+
 
 @dataclasses.dataclass(frozen=True)
 class TrainConfig:
@@ -48,8 +51,9 @@ class TrainConfig:
     """Passes over the samples of an update."""
     num_minibatches: int = 8
     """Optimiser steps per pass."""
-    microbatch: int = 128
-    """Samples per piece of a gradient, for the cache; changes nothing but speed."""
+    microbatch: int = 0
+    """Samples per piece of a gradient, for the cache; changes nothing but speed and rounding. 0: at
+    most 128 for beams, 32 for the paper's encoders."""
     learning_rate: float = 3e-4
     """Adam's step size when learning from rewards starts. Without a warm start, 3e-3 learns faster."""
     anneal: bool = True
@@ -87,6 +91,11 @@ class TrainConfig:
         return self.batch_size // self.num_minibatches
 
     @property
+    def piece_size(self) -> int:
+        """Samples per piece of a gradient: `microbatch`, or the largest divisor that suits the encoder."""
+        return self.microbatch or math.gcd(self.minibatch_size, PIECE_SIZES.get(self.encoder, 32))
+
+    @property
     def warm_start_updates(self) -> int:
         """Updates in which the policy imitates a rule."""
         return 0 if self.warm_start == NO_WARM_START else self.warm_start_steps // self.batch_size
@@ -97,7 +106,7 @@ class TrainConfig:
         return self.total_steps // self.batch_size
 
 
-_AT_LEAST_ONE = ("total_steps", "num_envs", "rollout_steps", "epochs", "num_minibatches", "microbatch")
+_AT_LEAST_ONE = ("total_steps", "num_envs", "rollout_steps", "epochs", "num_minibatches")
 _SHARES = ("gamma", "gae_lambda")
 _POSITIVE = ("learning_rate", "warm_start_learning_rate", "clip", "max_grad_norm", "reward_scale")
 _NOT_NEGATIVE = ("entropy_coefficient", "value_coefficient")
@@ -117,7 +126,7 @@ def check(config: TrainConfig) -> None:
     _require(config, "warm_start", config.warm_start in teachers, f"one of {', '.join(teachers)}")
     in_range = 0 <= config.seed <= LARGEST_SEED
     _require(config, "seed", in_range, f"an integer in [0, {LARGEST_SEED}]")
-    for name in ("evaluation_episodes", "warm_start_steps"):
+    for name in ("evaluation_episodes", "warm_start_steps", "microbatch"):
         _require(config, name, getattr(config, name) >= 0, "an integer >= 0")
     _require(config, "checkpoint_every", config.checkpoint_every >= 1, "an integer >= 1")
     for name in _SHARES:
@@ -149,7 +158,7 @@ def _check_batches(config: TrainConfig) -> None:
     _require(
         config,
         "microbatch",
-        config.minibatch_size % config.microbatch == 0,
+        config.minibatch_size % config.piece_size == 0,
         f"a divisor of the minibatch of {config.minibatch_size} samples",
     )
     _require(config, "total_steps", config.num_updates >= 1, f"at least one update: >= {samples}")

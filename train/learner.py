@@ -18,7 +18,8 @@ from jaxtrack.policies import POLICIES
 from train.agents import Agent, build_agent
 from train.config import TrainConfig
 from train.gae import advantages
-from train.loss import Sample, explained_variance, ppo_loss
+from train.loss import Sample, explained_variance
+from train.pieces import minibatch_gradient, shortest_first
 
 Chooser = Callable[[jax.Array, EnvState, jax.Array], jax.Array]
 """Key, states of the environments, and logits to actions `[B, 2]`."""
@@ -132,7 +133,7 @@ def collect(
 
     def one_step(carry: LearnerState, key: jax.Array) -> tuple[LearnerState, tuple[Transition, Any, Any]]:
         key_action, key_env = jax.random.split(key)
-        logits, value = agent.evaluate(carry.weights, carry.inputs)
+        logits, value = agent.evaluate_quickly(carry.weights, carry.inputs)
         action = choose(key_action, carry.env, logits)
         keys = jax.random.split(key_env, config.num_envs)
         observation, env_state, reward, terminated, truncated, info = jax.vmap(
@@ -225,6 +226,7 @@ def update_epochs(
 
     def one_minibatch(carry: tuple[Any, Any], rows: jax.Array) -> tuple[tuple[Any, Any], Any]:
         weights, optimiser_state = carry
+        rows = shortest_first(rows, flat.inputs, agent)
         minibatch = jax.tree.map(lambda leaf: leaf[rows], flat)
         grads, losses = minibatch_gradient(weights, minibatch, agent, config)
         updates, optimiser_state = optimiser.update(grads, optimiser_state, weights)
@@ -238,33 +240,6 @@ def update_epochs(
     carry = (state.weights, state.optimiser)
     carry, losses = jax.lax.scan(one_epoch, carry, jax.random.split(key, config.epochs))
     return *carry, jax.tree.map(jnp.mean, losses)
-
-
-def minibatch_gradient(
-    weights: Any, minibatch: Sample, agent: Agent, config: TrainConfig
-) -> tuple[Any, dict[str, jax.Array]]:
-    """Gradient of the loss over a minibatch, summed over pieces small enough for the cache."""
-    spread = minibatch.advantage.std() + 1e-8
-    normalised = (minibatch.advantage - minibatch.advantage.mean()) / spread
-    target = minibatch.value + minibatch.advantage
-    pieces = config.minibatch_size // config.microbatch
-    split = jax.tree.map(
-        lambda leaf: leaf.reshape(pieces, config.microbatch, *leaf.shape[1:]),
-        (minibatch, normalised, target),
-    )
-
-    def add_piece(total: Any, piece: Any) -> tuple[Any, None]:
-        return jax.tree.map(jnp.add, total, gradient(weights, *piece, agent, config)), None
-
-    gradient = jax.grad(ppo_loss, has_aux=True)
-    zeros = jax.tree.map(
-        lambda leaf: jnp.zeros(leaf.shape, leaf.dtype),
-        jax.eval_shape(
-            lambda piece: gradient(weights, *piece, agent, config), jax.tree.map(lambda x: x[0], split)
-        ),
-    )
-    total, _ = jax.lax.scan(add_piece, zeros, split)
-    return jax.tree.map(lambda leaf: leaf / pieces, total)
 
 
 def summarise(

@@ -19,6 +19,9 @@ ENCODERS: dict[str, type[nn.Module]] = {
 }
 """Track-list encoders by the name used on the command line."""
 
+ANY_LENGTH = ("bigru", "mhsa")
+"""Those that take a track list of any length, and to which empty slots at its end make no difference."""
+
 
 class PaperNetwork(nn.Module):
     """Shared features, then an MLP 2 x 128 for the policy and another for the value.

@@ -16,6 +16,7 @@ from train.beams import BeamInputs, BeamNetwork
 from train.config import TrainConfig
 from train.distributions import JOINT
 from train.loss import Sample, explained_variance, ppo_loss
+from train.pieces import minibatch_gradient
 
 BASE = TrainConfig(
     num_envs=8, rollout_steps=8, num_minibatches=2, microbatch=16, learning_rate=0.03, anneal=False
@@ -121,7 +122,7 @@ def test_the_microbatch_changes_nothing(draw_variables):
     @jax.jit
     def gradients(weights):
         in_pieces = [
-            learner.minibatch_gradient(weights, samples, agent, dataclasses.replace(config, microbatch=size))
+            minibatch_gradient(weights, samples, agent, dataclasses.replace(config, microbatch=size))
             for size in (16, 4)
         ]
         # The loss over the whole minibatch, its advantages normalised.
