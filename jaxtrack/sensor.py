@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
+from jaxtrack.kernel import stage
 from jaxtrack.models import direction, measurement_sigmas, spherical, wrap_detection
 from jaxtrack.params import Params, StaticParams
 from jaxtrack.sampling import matches, poisson_quantile
@@ -74,8 +75,16 @@ def look_number(angles: jax.Array, static: StaticParams, params: Params) -> jax.
 
 def boresight_frame(points: jax.Array, look: jax.Array) -> jax.Array:
     """Points `[..., 3]` turned so that the look `[2]` lies along x."""
-    cos_az, sin_az = jnp.cos(look[0]), jnp.sin(look[0])
-    cos_el, sin_el = jnp.cos(look[1]), jnp.sin(look[1])
+    return _turn(points, _cosines_and_sines(look))
+
+
+def _cosines_and_sines(look: jax.Array) -> tuple[jax.Array, ...]:
+    """Of azimuth, then of elevation of a look `[2, ...]`."""
+    return jnp.cos(look[0]), jnp.sin(look[0]), jnp.cos(look[1]), jnp.sin(look[1])
+
+
+def _turn(points: jax.Array, cosines_and_sines: tuple[jax.Array, ...]) -> jax.Array:
+    cos_az, sin_az, cos_el, sin_el = cosines_and_sines
     x, y, z = points[..., 0], points[..., 1], points[..., 2]
     forward = cos_az * x + sin_az * y
     return jnp.stack(
@@ -106,7 +115,11 @@ def in_beam(points: jax.Array, look: jax.Array, params: Params) -> jax.Array:
     Boresight bearing and elevation within half the beam's widths; written without arcs:
     ``|y| <= tan(b/2) x`` and ``|z| <= sin(e/2) r``.
     """
-    turned = boresight_frame(points, look)
+    return _ahead(boresight_frame(points, look), params)
+
+
+def _ahead(turned: jax.Array, params: Params) -> jax.Array:
+    """`in_beam` of points `[..., 3]` in the boresight frame."""
     x, y, z = turned[..., 0], turned[..., 1], turned[..., 2]
     half_bearing, half_elevation = params.beam_azimuth / 2, params.beam_elevation / 2
     in_bearing = jnp.abs(y) * jnp.cos(half_bearing) <= jnp.sin(half_bearing) * x
@@ -117,8 +130,10 @@ def in_beam(points: jax.Array, look: jax.Array, params: Params) -> jax.Array:
 
 def in_beams(points: jax.Array, looks: jax.Array, params: Params) -> jax.Array:
     """`[T, A]` whether points `[T, 3]` lie in the beams of looks `[A, 2]`."""
-    # The looks come last: a CPU works on several numbers at a time only along long rows.
-    return in_beam(points[:, None], looks.T, params)
+    # The looks come last: a CPU works on several numbers at a time only along long rows. And what is known
+    # of a look is worked out once, not again for every point.
+    of_looks = stage(_cosines_and_sines)(looks.T)
+    return _ahead(_turn(points[:, None], of_looks), params)
 
 
 def detect(
