@@ -17,6 +17,7 @@ from jaxtrack.params import Params, StaticParams
 from jaxtrack.policies import removed_variance
 from jaxtrack.scan_map import beam_means, beam_sizes, look_grid
 from jaxtrack.sensor import in_beams, look_number
+from train.orthogonal import orthogonal
 
 LOGIT_SCALE = 50.0
 """Good looks differ from poor ones by a few hundredths of a scan value: small weights must
@@ -142,4 +143,4 @@ class BeamNetwork(nn.Module):
 
 
 def _dense(features: int, name: str, gain: float = 2**0.5) -> nn.Dense:
-    return nn.Dense(features, kernel_init=nn.initializers.orthogonal(gain), name=name)
+    return nn.Dense(features, kernel_init=orthogonal(gain), name=name)

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 from flax import linen as nn
 
+from train.orthogonal import orthogonal
 from train.vision import GAIN
 
 Dtype = jnp.dtype
@@ -96,7 +97,7 @@ class GRU(nn.Module):
         # All time steps at once: one large product instead of T small ones in the scan.
         inputs = nn.Dense(3 * self.hidden, kernel_init=_per_gate(nn.initializers.xavier_uniform()))(x)
         shape = (self.hidden, 3 * self.hidden)
-        kernel = self.param("recurrent_kernel", _per_gate(nn.initializers.orthogonal()), shape)
+        kernel = self.param("recurrent_kernel", _per_gate(orthogonal()), shape)
         bias = self.param("recurrent_bias", nn.initializers.zeros, (self.hidden,))
 
         def step(state: jax.Array, row: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, None]:
@@ -132,7 +133,7 @@ def zero_padding(tracks: jax.Array, mask: jax.Array) -> jax.Array:
 
 
 def _dense(features: int, gain: float = GAIN, name: str | None = None) -> nn.Dense:
-    return nn.Dense(features, kernel_init=nn.initializers.orthogonal(gain), name=name)
+    return nn.Dense(features, kernel_init=orthogonal(gain), name=name)
 
 
 def _per_gate(initialise: nn.initializers.Initializer) -> nn.initializers.Initializer:

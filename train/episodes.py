@@ -19,7 +19,7 @@ from jaxtrack.params import Params
 from jaxtrack.policies import Policy, PolicyBuilder
 from train.episode_metrics import CURVES, METRICS, StepRow, episode_curves, episode_values, step_row
 
-MEMORY = 200e6
+MEMORY = 105e6
 """Bytes that the record of a chunk may take. The same on every machine, because rounding differs with
 the size of a chunk, and a policy that meets a tie may then take another look."""
 MOST_WORKERS = 8

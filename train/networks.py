@@ -10,6 +10,7 @@ from flax import linen as nn
 
 from jaxtrack.observation import Observation
 from train.encoders import AttentionEncoder, BiGRUEncoder, FlattenEncoder
+from train.orthogonal import orthogonal
 from train.vision import GAIN, NatureCNN
 
 ENCODERS: dict[str, type[nn.Module]] = {
@@ -75,5 +76,5 @@ class MLP(nn.Module):
     def __call__(self, x: jax.Array) -> jax.Array:
         """Maps `[B, F]` to `[B, outputs]`."""
         for width in self.widths:
-            x = nn.tanh(nn.Dense(width, kernel_init=nn.initializers.orthogonal(GAIN))(x))
-        return nn.Dense(self.outputs, kernel_init=nn.initializers.orthogonal(self.output_gain))(x)
+            x = nn.tanh(nn.Dense(width, kernel_init=orthogonal(GAIN))(x))
+        return nn.Dense(self.outputs, kernel_init=orthogonal(self.output_gain))(x)

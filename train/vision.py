@@ -11,6 +11,8 @@ import jax
 import jax.numpy as jnp
 from flax import linen as nn
 
+from train.orthogonal import orthogonal
+
 GAIN = 2**0.5
 """Gain of the orthogonal initialisation of every layer but the heads (as in SB3)."""
 
@@ -40,7 +42,7 @@ class NatureCNN(nn.Module):
         for channels, size, stride in LAYERS:
             x = nn.relu(Convolution(channels, size, stride, self.by_matmul)(x))
         x = x.reshape(x.shape[0], -1)
-        return nn.relu(nn.Dense(self.features, kernel_init=nn.initializers.orthogonal(GAIN))(x))
+        return nn.relu(nn.Dense(self.features, kernel_init=orthogonal(GAIN))(x))
 
 
 def pixels_used(size: int) -> int:
@@ -68,7 +70,7 @@ class Convolution(nn.Module):
     def __call__(self, images: jax.Array) -> jax.Array:
         """Maps images `[B, H, W, C]` to `[B, H', W', features]`, H' = (H - size) // stride + 1."""
         shape = (self.size, self.size, images.shape[-1], self.features)
-        kernel = self.param("kernel", nn.initializers.orthogonal(GAIN), shape)
+        kernel = self.param("kernel", orthogonal(GAIN), shape)
         bias = self.param("bias", nn.initializers.zeros, (self.features,))
         by_matmul = jax.default_backend() == "cpu" if self.by_matmul is None else self.by_matmul
         convolve = convolve_by_matmul if by_matmul else convolve_by_xla
