@@ -20,7 +20,7 @@ from jaxtrack.sampling import split
 from jaxtrack.scan_map import initial_scan_map, mean_scan_value, update_scan_map
 from jaxtrack.sensor import detect, look_angles
 from jaxtrack.truth import initiate_truths, propagate_truths
-from jaxtrack.types import Tracks, Truths
+from jaxtrack.types import Tracks
 
 ENV_ID = "SearchTrack-v0"
 
@@ -78,29 +78,21 @@ class SearchTrack(environment.Environment[EnvState, Params]):
         last, moved, reward, terminated, info = self.step_env(key_step, state, action, params)
         truncated = self.is_truncated(moved, params)
         done = terminated | truncated
-        observation, state = self._begin_again_if(done, key_reset, last, moved, params)
+        state = rarely(done, self._begin, (key_reset, params), moved)
+        # Twice the same as long as no episode ends; but then mostly nobody asks for the final one.
+        observation = self.observe(key_step, state, action, params)
         ended = {"terminated": terminated, "truncated": truncated, "final_observation": last}
         return observation, state, reward, terminated, truncated, {**info, **ended}
-
-    def _begin_again_if(
-        self, done: jax.Array, key: jax.Array, observation: Observation, state: EnvState, params: Params
-    ) -> tuple[Observation, EnvState]:
-        """A new episode if the old one is `done`."""
-
-        def begin(key: jax.Array, params: Params) -> tuple[Observation, EnvState]:
-            observation, state = self._begin(key, initiate_truths(key, self.static, params), params)
-            return _without_map(observation), state
-
-        observation, state = rarely(done, begin, (key, params), (_without_map(observation), state))
-        return {**observation, "scan_map": state.scan_map}, state
 
     def reset_env(self, key: jax.Array, params: Params) -> tuple[Observation, EnvState]:
         """New truths, no tracks, a field never seen."""
         check_trajectories(self.static, params)
-        return self._begin(key, initiate_truths(key, self.static, params), params)
+        state = self._begin(key, params)
+        return self.observe(key, state, None, params), state
 
-    def _begin(self, key: jax.Array, truths: Truths, params: Params) -> tuple[Observation, EnvState]:
-        state = EnvState(
+    def _begin(self, key: jax.Array, params: Params) -> EnvState:
+        truths = initiate_truths(key, self.static, params)
+        return EnvState(
             time=jnp.asarray(0, dtype=int),
             truths=truths,
             tracks=Tracks.empty(self.static.max_tracks),
@@ -108,7 +100,6 @@ class SearchTrack(environment.Environment[EnvState, Params]):
             num_born=jnp.sum(truths.alive),
             num_initiated=jnp.asarray(0, dtype=int),
         )
-        return self.observe(key, state, None, params), state
 
     def step_env(
         self, key: jax.Array, state: EnvState, action: jax.Array, params: Params
@@ -221,11 +212,6 @@ def step_info(
         "dropped_detections": record.num_dropped_detections,
         "dropped_tracks": record.num_dropped_tracks,
     }
-
-
-def _without_map(observation: Observation) -> Observation:
-    """The observation without the map, which is that of the state: it need not be carried twice."""
-    return {name: value for name, value in observation.items() if name != "scan_map"}
 
 
 def make(
