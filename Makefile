@@ -7,13 +7,14 @@ ARGS ?=
 
 export JAX_PLATFORMS ?= cpu
 
-.PHONY: help setup train test slow sb3 parity lint bench clean
+.PHONY: help setup train test slow sb3 peers parity lint bench clean
 
 help:
 	@echo "make train   train an agent, compare it with the baselines, draw pictures (runs/)"
 	@echo "make test    lint, types and all quick tests"
 	@echo "make slow    the tests that take longer"
 	@echo "make sb3     the tests that need Stable-Baselines3, which it installs (with torch, 1 GB)"
+	@echo "make peers   the comparison with FilterPy, which it installs"
 	@echo "make parity  the parity table of the README, in full"
 	@echo "make lint    ruff and mypy only"
 	@echo "make bench   speeds beside Stone Soup's and FilterPy's in ten minutes (bench/)"
@@ -42,6 +43,10 @@ slow: setup
 sb3: setup
 	$(BIN)/pip install --quiet --editable ".[sb3]"
 	$(BIN)/pytest -m sb3 $(ARGS)
+
+peers: setup
+	$(BIN)/pip install --quiet --editable ".[bench]"
+	$(BIN)/pytest tests/test_tracker_benchmark.py $(ARGS)
 
 parity: setup
 	$(BIN)/python -m reference.parity --out docs/parity.json --readme README.md $(ARGS)

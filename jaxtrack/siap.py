@@ -126,12 +126,12 @@ def _over_record(
     """Of a record: counts `[K]`, followed times `[K]`, longest times `[N]`, changes of track `[N]`."""
     begun = begins(tracks)
     stretches = associate_tracks_to_truths(truths, tracks, begun, params)
-    found = look_back(truths, tracks, begun, stretches, durations)
+    found = _look_back(truths, tracks, begun, stretches, durations)
     changes = jnp.maximum(tracks_needed(found.stretch_end, truths.alive) - 1, 0)
     return found.counts, found.followed, found.spent, changes
 
 
-def look_back(
+def _look_back(
     truths: Truths, tracks: Tracks, begun: jax.Array, stretches: Stretch, durations: jax.Array
 ) -> _Found:
     """Goes from the last step to the first: a stretch is known from its end on.
