@@ -6,7 +6,6 @@ if __name__ == "__main__":
     cores.use()  # before gymnax is imported, which starts JAX
 
 import dataclasses
-import json
 import sys
 import time
 from collections.abc import Sequence
@@ -25,7 +24,7 @@ from jaxtrack import policies
 from jaxtrack.cli import parse, require_file, require_integer, run
 from jaxtrack.env import make
 from jaxtrack.params import Params, StaticParams
-from jaxtrack.report import circumstances, print_table, spread
+from jaxtrack.report import circumstances, print_table, spread, write_report
 from reference.simulation import StoneSoupScenario
 
 
@@ -204,9 +203,7 @@ def main(argv: Sequence[str]) -> int:
     )
     print_table(HEADER, [cells(row) for row in rows], title, options.markdown, console)
     if options.out is not None:
-        report["options"] = {k: v for k, v in vars(options).items() if k not in ("out", "markdown")}
-        report["scenario"] = {**vars(static), **vars(params)}
-        options.out.write_text(json.dumps({**report, "rows": rows}, indent=2) + "\n")
+        write_report(options.out, report, options, scenario={**vars(static), **vars(params)}, rows=rows)
     return 0
 
 

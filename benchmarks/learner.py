@@ -1,7 +1,6 @@
 """Steps per second of our learner and of Stable-Baselines3's PPO: `python -m benchmarks.learner`."""
 
 import dataclasses
-import json
 import sys
 import time
 from collections.abc import Callable, Sequence
@@ -16,7 +15,7 @@ from rich.progress import Progress
 from benchmarks.still_world import StillWorld
 from jaxtrack.cli import parse, require_file, require_integer, run
 from jaxtrack.params import Params, StaticParams
-from jaxtrack.report import PACKAGES, circumstances, print_table, spread
+from jaxtrack.report import PACKAGES, circumstances, print_table, spread, write_report
 from train import learner
 from train.config import TrainConfig
 from train.networks import ENCODERS
@@ -215,9 +214,8 @@ def main(argv: Sequence[str]) -> int:
     print_table(HEADER, [cells(row) for row in rows], title, options.markdown, console)
     if options.out is not None:
         report["machine"]["torch_threads"] = threads
-        report["options"] = {k: v for k, v in vars(options).items() if k not in ("out", "markdown")}
-        report["scenario"] = {**vars(StaticParams()), **vars(Params())}
-        options.out.write_text(json.dumps({**report, "rows": rows}, indent=2) + "\n")
+        scenario = {**vars(StaticParams()), **vars(Params())}
+        write_report(options.out, report, options, scenario=scenario, rows=rows)
     return 0
 
 

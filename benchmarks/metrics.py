@@ -1,7 +1,6 @@
 """GOSPA and SIAP of whole episodes, ours and Stone Soup's: `python -m benchmarks.metrics`."""
 
 import dataclasses
-import json
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -16,12 +15,11 @@ from stonesoup.metricgenerator.base import MetricGenerator
 from stonesoup.metricgenerator.manager import MultiManager
 
 from benchmarks.operations import mean_seconds
-from benchmarks.planning import with_spread, written
 from jaxtrack import policies
-from jaxtrack.cli import parse, require_file, require_integer, run, wide_console
+from jaxtrack.cli import parse, require_file, require_integer, require_positive, run, wide_console
 from jaxtrack.env import make
 from jaxtrack.params import Params, StaticParams
-from jaxtrack.report import circumstances, print_table, spread
+from jaxtrack.report import circumstances, print_table, spread, with_spread, write_report, written
 from jaxtrack.types import Tracks, Truths
 from reference.components import step_duration
 from reference.parity.metrics import Ours, largest_error, our_gospa, our_siap
@@ -59,8 +57,7 @@ def check(options: MetricsOptions, params: Params) -> None:
     require_integer("batch", options.batch, 2)
     require_integer("repeats", options.repeats, 1)
     require_integer("seed", options.seed, 0)
-    if not 0 < options.min_seconds < np.inf:
-        raise ValueError(f"min_seconds = {options.min_seconds}: expected a number > 0")
+    require_positive("min_seconds", options.min_seconds)
     if options.out is not None:
         require_file("out", options.out)
 
@@ -235,10 +232,8 @@ def main(argv: Sequence[str]) -> int:
     )
     print_table(HEADER, [cells(row) for row in rows], title, options.markdown, console)
     if options.out is not None:
-        report["options"] = {k: v for k, v in vars(options).items() if k not in ("out", "markdown")}
-        report["scenario"] = {**vars(static), **vars(params)}
-        found = {"largest_difference": largest, "rows": rows}
-        options.out.write_text(json.dumps({**report, **found}, indent=2) + "\n")
+        scenario = {**vars(static), **vars(params)}
+        write_report(options.out, report, options, scenario=scenario, largest_difference=largest, rows=rows)
     return 0 if same else DIFFERENT
 
 

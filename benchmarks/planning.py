@@ -2,7 +2,6 @@
 
 import dataclasses
 import functools
-import json
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -14,12 +13,12 @@ from rich.progress import Progress
 
 from benchmarks.playing import first, raster
 from jaxtrack import policies
-from jaxtrack.cli import parse, require_file, require_integer, run, wide_console
+from jaxtrack.cli import parse, require_file, require_integer, require_positive, run, wide_console
 from jaxtrack.env import make
 from jaxtrack.episode import EnvState
 from jaxtrack.managers import expected_falls, greedy, rollout, uncertainty
 from jaxtrack.params import Params, StaticParams
-from jaxtrack.report import circumstances, print_table, spread
+from jaxtrack.report import circumstances, print_table, spread, with_spread, write_report
 from jaxtrack.scan_map import look_grid
 from reference.components import time_of
 from reference.managers import build_manager, look_of
@@ -67,8 +66,7 @@ def check(options: PlanningOptions, static: StaticParams) -> None:
         require_integer(name, value, 1)
     if max(options.candidates) > static.num_looks**2:
         raise ValueError(f"candidates = {max(options.candidates)}: expected at most {static.num_looks**2}")
-    if not 0 < options.min_seconds < np.inf:
-        raise ValueError(f"min_seconds = {options.min_seconds}: expected a number > 0")
+    require_positive("min_seconds", options.min_seconds)
     require_integer("seed", options.seed, 0)
     if options.out is not None:
         require_file("out", options.out)
@@ -196,16 +194,6 @@ def make_row(
 HEADER = ("manager", "states", "decisions/s", "ratio", "compiled in")
 
 
-def written(speed: float) -> str:
-    """A speed with at least three digits."""
-    return f"{speed:,.0f}" if speed >= 100 else f"{speed:#.3g}"
-
-
-def with_spread(speed: dict[str, Any]) -> str:
-    """Median (smallest - largest) of `report.spread`."""
-    return "{} ({} - {})".format(*(written(speed[which]) for which in ("median", "min", "max")))
-
-
 def cells(row: dict[str, Any]) -> list[str]:
     """The row under `HEADER`."""
     speed, seconds = row["decisions_per_second"], row["compile_seconds"]
@@ -234,9 +222,7 @@ def main(argv: Sequence[str]) -> int:
     )
     print_table(HEADER, [cells(row) for row in found["rows"]], title, options.markdown, console)
     if options.out is not None:
-        report["options"] = {k: v for k, v in vars(options).items() if k not in ("out", "markdown")}
-        report["scenario"] = {**vars(static), **vars(params)}
-        options.out.write_text(json.dumps({**report, **found}, indent=2) + "\n")
+        write_report(options.out, report, options, scenario={**vars(static), **vars(params)}, **found)
     return DIFFERENT if different else 0
 
 

@@ -11,6 +11,7 @@ from jaxtrack.env import SearchTrack
 from jaxtrack.episode import EnvState
 from jaxtrack.observation import Observation
 from jaxtrack.params import Params, StaticParams
+from jaxtrack.sampling import split
 
 Tree = TypeVar("Tree")
 Start = tuple[Observation, EnvState]
@@ -43,7 +44,7 @@ def play(
         `info`: all of them are asked for, so that none is optimised away.
     """
     policy = build(env.static, params)
-    policy_keys, step_keys = jnp.moveaxis(jax.vmap(jax.random.split)(keys), 1, 0)
+    policy_keys, step_keys = jax.vmap(split)(keys)
     of_steps = jax.vmap(lambda key: jax.random.split(key, steps), out_axes=1)(step_keys)
 
     def one_step(carry: Start, keys: jax.Array) -> tuple[Start, dict[str, jax.Array]]:

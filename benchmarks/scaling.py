@@ -6,24 +6,21 @@ if __name__ == "__main__":
     cores.use()  # before gymnax is imported, which starts JAX
 
 import dataclasses
-import json
-import time
 from collections.abc import Sequence
 from itertools import product
 from pathlib import Path
 from typing import Any
 
 import jax
-import numpy as np
 from rich.progress import Progress
 
-from benchmarks.planning import written
+from benchmarks.operations import mean_seconds
 from benchmarks.playing import compile_play, pointing
 from benchmarks.scaling_fit import AXES, Axis, draw, fit
-from jaxtrack.cli import parse, require_file, require_integer, run, wide_console
+from jaxtrack.cli import parse, require_file, require_integer, require_positive, run, wide_console
 from jaxtrack.env import LARGEST_IN_ONE_KERNEL, make
 from jaxtrack.params import Params, StaticParams
-from jaxtrack.report import circumstances, print_table, spread
+from jaxtrack.report import circumstances, print_table, spread, write_report, written
 
 FIGURES = (".png", ".svg", ".pdf")
 WARM_UP = 2
@@ -84,8 +81,7 @@ def check(options: ScalingOptions, params: Params) -> None:
     for name, low in (("repeats", 1), ("seed", 0)):
         require_integer(name, getattr(options, name), low)
     require_integer("steps", options.steps, 1, params.max_steps_in_episode // 4)
-    if not 0 < options.min_seconds < np.inf:
-        raise ValueError(f"min_seconds = {options.min_seconds}: expected a number > 0")
+    require_positive("min_seconds", options.min_seconds)
     for name in ("out", "figure"):
         if (path := getattr(options, name)) is not None:
             require_file(name, path)
@@ -128,11 +124,8 @@ class Program:
 
     def time(self, min_seconds: float) -> float:
         """Time of one step of all environments (µs), from the same start again and again."""
-        calls, began = 0, time.perf_counter()
-        while (seconds := time.perf_counter() - began) < min_seconds or not calls:
-            jax.block_until_ready(self.compiled(self.keys, self.start, self.params))
-            calls += 1
-        return 1e6 * seconds / calls / self.steps
+        seconds = mean_seconds(lambda: self.compiled(self.keys, self.start, self.params), min_seconds)
+        return 1e6 * seconds / self.steps
 
 
 def measure(
@@ -210,10 +203,7 @@ def main(argv: Sequence[str]) -> int:
     if options.figure is not None:
         draw(rows, options.figure, title)
     if options.out is not None:
-        left_out = ("out", "figure", "markdown")
-        report["options"] = {k: v for k, v in vars(options).items() if k not in left_out}
-        report["scenario"] = {**vars(static), **vars(params)}
-        options.out.write_text(json.dumps({**report, "rows": rows}, indent=2) + "\n")
+        write_report(options.out, report, options, scenario={**vars(static), **vars(params)}, rows=rows)
     return 0
 
 

@@ -1,9 +1,7 @@
 """The filter and the tracker's step by us, Stone Soup and FilterPy: `python -m benchmarks.tracker`."""
 
 import dataclasses
-import json
 from collections.abc import Callable, Sequence
-from importlib.metadata import version
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -14,12 +12,11 @@ from rich.progress import Progress
 
 from benchmarks.operations import OPERATIONS, Ours
 from benchmarks.peers import FilterPy, StoneSoup, has_filterpy
-from benchmarks.planning import with_spread, written
 from benchmarks.scene import Scene, Timed, error, random_scenes
-from jaxtrack.cli import parse, require_file, require_integer, run, wide_console
+from jaxtrack.cli import parse, require_file, require_integer, require_positive, run, wide_console
 from jaxtrack.env import LARGEST_IN_ONE_KERNEL
 from jaxtrack.params import Params
-from jaxtrack.report import circumstances, print_table, spread
+from jaxtrack.report import PACKAGES, circumstances, print_table, spread, with_spread, write_report, written
 
 DIFFERENT = 1
 TOLERANCE = {"float64": 1e-9, "float32": 2e-2}
@@ -60,8 +57,7 @@ def check(options: TrackerOptions) -> None:
     require_integer("batch", options.batch, 2)
     require_integer("repeats", options.repeats, 1)
     require_integer("seed", options.seed, 0)
-    if not 0 < options.min_seconds < np.inf:
-        raise ValueError(f"min_seconds = {options.min_seconds}: expected a number > 0")
+    require_positive("min_seconds", options.min_seconds)
     if options.out is not None:
         require_file("out", options.out)
 
@@ -177,7 +173,7 @@ def main(argv: Sequence[str]) -> int:
     """The command; returns the exit code."""
     options = parse(TrackerOptions(), argv, "python -m benchmarks.tracker")
     check(options)
-    params, report, console = Params(), circumstances(), wide_console()
+    params, report, console = Params(), circumstances((*PACKAGES, "filterpy")), wide_console()
     with Progress(console=console, disable=not console.is_terminal) as progress:
         rows = measure(options, params, progress)
     kind = "float32" if options.single else "float64"
@@ -194,12 +190,8 @@ def main(argv: Sequence[str]) -> int:
     )
     print_table(header(rows), [cells(row, with_filterpy) for row in rows], title, options.markdown, console)
     if options.out is not None:
-        if with_filterpy:
-            report["versions"]["filterpy"] = version("filterpy")
-        report["options"] = {k: v for k, v in vars(options).items() if k not in ("out", "markdown")}
-        report["scenario"] = vars(params)
         found = {"largest_difference_sigma": largest, "rows": rows}
-        options.out.write_text(json.dumps({**report, **found}, indent=2) + "\n")
+        write_report(options.out, report, options, scenario=vars(params), **found)
     return 0 if same else DIFFERENT
 
 

@@ -2,7 +2,6 @@
 
 import dataclasses
 import datetime
-import json
 import resource
 import sys
 import tempfile
@@ -17,7 +16,7 @@ import numpy as np
 from jaxtrack.cli import parse, require_file, require_integer, run, wide_console
 from jaxtrack.detection_file import COLUMNS, RecordedDetections, read_detections
 from jaxtrack.params import Params
-from jaxtrack.report import circumstances, print_table
+from jaxtrack.report import circumstances, print_table, write_report
 from jaxtrack.track import Options, track_file
 from jaxtrack.tracking import TrackRows, track_scans
 from reference.components import EPOCH, noise_sigmas
@@ -213,9 +212,7 @@ def main(argv: Sequence[str]) -> int:
     )
     print_table(HEADER, cells(row), title, options.markdown, wide_console())
     if options.out is not None:
-        report["options"] = {k: v for k, v in vars(options).items() if k not in ("out", "markdown")}
-        report["scenario"] = vars(PARAMS)
-        options.out.write_text(json.dumps({**report, **row}, indent=2) + "\n")
+        write_report(options.out, report, options, scenario=vars(PARAMS), **row)
     return 0 if same else DIFFERENT
 
 

@@ -3,6 +3,7 @@
 import contextlib
 import io
 import json
+import math
 import re
 import sys
 import tomllib
@@ -104,6 +105,12 @@ def require_integer(name: str, value: int, low: int, high: int | None = None) ->
     if value < low or (high is not None and value > high):
         allowed = f">= {low}" if high is None else f"in [{low}, {high}]"
         raise ValueError(f"{name} = {value}: expected an integer {allowed}")
+
+
+def require_positive(name: str, value: float) -> None:
+    """Raises ValueError, naming the option, if its value is not a finite number above zero."""
+    if not 0 < value < math.inf:
+        raise ValueError(f"{name} = {value}: expected a number > 0")
 
 
 def require_file(name: str, path: Path) -> None:

@@ -15,6 +15,7 @@ from jaxtrack.cli import require_integer
 from jaxtrack.env import SearchTrack, make
 from jaxtrack.episode import EnvState
 from jaxtrack.params import Params, StaticParams
+from jaxtrack.sampling import split
 
 Observation = dict[str, np.ndarray]
 NUM_SEEDS = 2**32
@@ -161,12 +162,12 @@ def _programs(static: StaticParams, image: bool) -> tuple[Callable, Callable]:
         return {**shown, "scan_map": image_of(observation["scan_map"])} if image else shown
 
     def begin(keys: jax.Array, params: Params) -> _Carry:
-        keys, reset_keys = jnp.moveaxis(jax.vmap(jax.random.split)(keys), 1, 0)
+        keys, reset_keys = jax.vmap(split)(keys)
         observation, state = jax.vmap(env.reset, in_axes=(0, None))(reset_keys, params)
         return _Carry(keys, state, present(observation))
 
     def advance(keys: jax.Array, state: EnvState, actions: jax.Array, params: Params) -> tuple[Any, ...]:
-        keys, step_keys = jnp.moveaxis(jax.vmap(jax.random.split)(keys), 1, 0)
+        keys, step_keys = jax.vmap(split)(keys)
         observation, state, reward, terminated, truncated, info = jax.vmap(env.step, in_axes=(0, 0, 0, None))(
             step_keys, state, actions, params
         )

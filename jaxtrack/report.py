@@ -1,5 +1,6 @@
 """What every command reports beside its figures, and how tables are printed."""
 
+import json
 import platform
 from collections.abc import Sequence
 from datetime import UTC, datetime
@@ -14,6 +15,7 @@ from rich.table import Table
 
 from jaxtrack import cores
 
+OUTPUT_OPTIONS = ("out", "figure", "markdown")
 PACKAGES = ("jaxtrack", "jax", "jaxlib", "gymnax", "numpy", "stonesoup")
 
 
@@ -25,6 +27,22 @@ def spread(values: Sequence[float]) -> dict[str, Any]:
         "max": max(values),
         "repeats": list(values),
     }
+
+
+def written(number: float) -> str:
+    """A number with at least three digits."""
+    return f"{number:,.0f}" if number >= 100 else f"{number:#.3g}"
+
+
+def with_spread(values: dict[str, Any]) -> str:
+    """Median (smallest - largest) of `spread`."""
+    return "{} ({} - {})".format(*(written(values[which]) for which in ("median", "min", "max")))
+
+
+def write_report(file: Path, report: dict[str, Any], options: Any, **found: Any) -> None:
+    """Writes a JSON file: the circumstances, the options that are not about output, and what was found."""
+    asked = {name: value for name, value in vars(options).items() if name not in OUTPUT_OPTIONS}
+    file.write_text(json.dumps({**report, "options": asked, **found}, indent=2) + "\n")
 
 
 def circumstances(packages: Sequence[str] = PACKAGES) -> dict[str, Any]:

@@ -99,8 +99,7 @@ def _turn(points: jax.Array, cosines_and_sines: tuple[jax.Array, ...]) -> jax.Ar
 
 def platform_frame(points: jax.Array, look: jax.Array) -> jax.Array:
     """Inverse of `boresight_frame`."""
-    cos_az, sin_az = jnp.cos(look[0]), jnp.sin(look[0])
-    cos_el, sin_el = jnp.cos(look[1]), jnp.sin(look[1])
+    cos_az, sin_az, cos_el, sin_el = _cosines_and_sines(look)
     x, y, z = points[..., 0], points[..., 1], points[..., 2]
     forward = cos_el * x - sin_el * z
     return jnp.stack(

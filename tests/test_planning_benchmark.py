@@ -9,7 +9,7 @@ from rich.progress import Progress
 
 from benchmarks import planning
 from benchmarks.planning import PlanningOptions
-from jaxtrack import Params, StaticParams
+from jaxtrack import Params, StaticParams, report
 from jaxtrack.managers import expected_falls
 from jaxtrack.scan_map import look_grid
 
@@ -77,7 +77,7 @@ def test_ours_counts_the_decisions_of_every_state(states, monkeypatch):
 
 
 def test_speeds_are_written_without_exponents():
-    assert [planning.written(speed) for speed in (1.5, 43.48, 376.5, 53580.0)] == [
+    assert [report.written(speed) for speed in (1.5, 43.48, 376.5, 53580.0)] == [
         "1.50",
         "43.5",
         "376",

@@ -87,22 +87,6 @@ def step_row(
     """Everything that is measured of one step."""
     truths, tracks = after.truths, after.tracks
     reward = reward_terms(before.tracks, tracks, truths, after.scan_map, env.static, params)
-    values, tracked = _of_tracks(truths, tracks, params)
-    return StepRow(
-        values={
-            **values,
-            "mean_scan_value": mean_scan_value(after.scan_map),
-            "reward": reward[0] + reward[1],
-        },
-        truths=truths,
-        tracks=tracks.replace(covariance=None),
-        tracked=tracked,
-        look=look_number(record.look, env.static, params),
-    )
-
-
-def _of_tracks(truths: Truths, tracks: Tracks, params: Params) -> tuple[dict[str, jax.Array], jax.Array]:
-    """What is measured of the track list, and which truths `[N]` have a track within the GOSPA cut-off."""
     distances = metrics.position_distances(truths, tracks)
     values = {
         **_gospa(truths, tracks, params),
@@ -112,8 +96,16 @@ def _of_tracks(truths: Truths, tracks: Tracks, params: Params) -> tuple[dict[str
         "covariance_norm_mean": metrics.covariance_norm_mean(tracks),
         "covariance_norm_sum": metrics.covariance_norm_sum(tracks),
         "uncertainty_per_truth": metrics.uncertainty_per_truth(truths, tracks, params),
+        "mean_scan_value": mean_scan_value(after.scan_map),
+        "reward": reward[0] + reward[1],
     }
-    return values, jnp.any(distances < params.gospa_cutoff, axis=-1)
+    return StepRow(
+        values=values,
+        truths=truths,
+        tracks=tracks.replace(covariance=None),
+        tracked=jnp.any(distances < params.gospa_cutoff, axis=-1),
+        look=look_number(record.look, env.static, params),
+    )
 
 
 def episode_values(rows: StepRow, params: Params) -> dict[str, jax.Array]:
