@@ -101,6 +101,7 @@ def configure(encoder: str, options: LearnerOptions) -> TrainConfig:
     samples = options.num_envs * options.rollout_steps
     return TrainConfig(
         encoder=encoder,
+        head="factored",
         num_envs=options.num_envs,
         rollout_steps=options.rollout_steps,
         num_minibatches=samples // options.minibatch_size,

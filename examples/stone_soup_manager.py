@@ -128,7 +128,7 @@ def chosen(options: ManagerOptions) -> tuple[str, PolicyBuilder, StaticParams, P
         StoneSoupScenario(env.static, config.params)  # refuses what is not simulated here
         return (
             str(options.run),
-            agent_policy(config.encoder, weights, options.greedy),
+            agent_policy(config.encoder, weights, options.greedy, config.head),
             env.static,
             config.params,
         )

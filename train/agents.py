@@ -75,41 +75,55 @@ class Agent(NamedTuple):
         return self.lists.apply(function, inputs) if self.lists else function(inputs)
 
 
-def build_agent(name: str, static: StaticParams, params: Params) -> Agent:
+def build_agent(name: str, static: StaticParams, params: Params, head: str = "beams") -> Agent:
     """The agent of that name for a scenario.
 
     Call it inside the jitted program, where `params` are traced: what the geometry fixes is
     then computed there once, instead of being compiled in as a large constant.
+
+    Args:
+        name: one of `AGENTS`.
+        static: shapes.
+        params: numbers.
+        head: how it chooses a look, one of `train.networks.HEADS`; the beam policy has only "beams".
 
     Raises:
         ValueError: if the name is none of `AGENTS`.
     """
     if name not in AGENTS:
         raise ValueError(f"encoder = {name!r}: expected one of {', '.join(AGENTS)}")
+    beams = BeamGeometry(static, params)
     if name == "beams":
-        return Agent(BeamGeometry(static, params), BeamNetwork(), JOINT)
-    network = PaperNetwork(encoder=name, num_looks=static.num_looks)
+        return Agent(beams, BeamNetwork(), JOINT)
+    network = PaperNetwork(encoder=name, head=head, num_looks=static.num_looks)
+    distribution = FACTORED if head == "factored" else JOINT
     lists = TrackLists(static.max_tracks, used_slots, cut_lists) if name in ANY_LENGTH else None
-    return Agent(lambda observation: observation, network, FACTORED, lists)
+
+    def features(observation: Observation) -> Any:
+        return {**observation, "beams": beams(observation)} if head == "beams" else observation
+
+    return Agent(features, network, distribution, lists)
 
 
-def used_slots(observations: Observation) -> jax.Array:
+def used_slots(observations: dict[str, Any]) -> jax.Array:
     """Slots `[B]` up to the last track of each observation."""
     mask = observations["mask"]
     return jnp.max(jnp.where(mask, jnp.arange(1, mask.shape[-1] + 1), 0), axis=-1)
 
 
-def cut_lists(observations: Observation, length: int) -> Observation:
+def cut_lists(observations: dict[str, Any], length: int) -> dict[str, Any]:
     """The observations with the first `length` slots of their track lists."""
-    mask, tracks = observations["mask"][:, :length], observations["tracks"][:, :length]
-    return {**observations, "mask": mask, "tracks": tracks}
+    cut = {name: observations[name][:, :length] for name in ("mask", "tracks")}
+    if "beams" in observations:
+        cut["beams"] = observations["beams"].first_tracks(length)
+    return {**observations, **cut}
 
 
-def agent_policy(name: str, weights: Any, greedy: bool = False) -> PolicyBuilder:
+def agent_policy(name: str, weights: Any, greedy: bool = False, head: str = "beams") -> PolicyBuilder:
     """A trained agent in the form of the baselines; it samples its looks unless `greedy`."""
 
     def build(static: StaticParams, params: Params) -> Policy:
-        agent = build_agent(name, static, params)
+        agent = build_agent(name, static, params, head)
 
         def policy(key: jax.Array, state: EnvState) -> jax.Array:
             observation = observe(state.tracks, state.scan_map, params, static.observe_variances)

@@ -23,6 +23,9 @@ LOGIT_SCALE = 50.0
 """Good looks differ from poor ones by a few hundredths of a scan value: small weights must
 be able to tell them apart by several nats, or the policy stays almost uniform."""
 
+HEAD_GAIN = 0.01
+"""Gain of the orthogonal initialisation of what makes logits: the first policy is almost uniform."""
+
 NEVER_SEEN = 0.9999
 """Scan value above which a pixel counts as never looked at."""
 
@@ -58,6 +61,15 @@ class BeamInputs(struct.PyTreeNode):
     tracks: jax.Array  # [..., T, F]
     mask: jax.Array  # [..., T] bool
     context: jax.Array  # [..., 6]
+
+    def first_tracks(self, length: int) -> "BeamInputs":
+        """The same with the first `length` slots for tracks."""
+        cut: BeamInputs = self.replace(
+            inside=self.inside[..., :length, :],
+            tracks=self.tracks[..., :length, :],
+            mask=self.mask[..., :length],
+        )
+        return cut
 
 
 class BeamGeometry:
@@ -118,6 +130,39 @@ def mean_of_neighbours(grid: jax.Array) -> jax.Array:
     return (rows[:, :-2] + rows[:, 1:-1] + rows[:, 2:] - grid) / 8
 
 
+class TrackRows(nn.Module):
+    """A small network, the same for all tracks, that reads each of them in what is known of all."""
+
+    width: int = 32
+
+    @nn.compact
+    def __call__(self, inputs: BeamInputs, context: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Urgencies `[..., T]` of a look at each track, and rows `[..., T, width]`; 0 where there is none.
+
+        Args:
+            inputs: the tracks.
+            context: `[..., C]` what is known of all.
+        """
+        rows = _dense(self.width, "tracks")(inputs.tracks)
+        rows += _dense(self.width, "context")(context)[..., None, :]
+        rows = nn.relu(_dense(self.width, "hidden")(nn.relu(rows)))
+        urgencies = _dense(1, "urgency", HEAD_GAIN)(rows)[..., 0]
+        return jnp.where(inputs.mask, urgencies, 0.0), jnp.where(inputs.mask[..., None], rows, 0.0)
+
+
+def logits_of_looks(prices: jax.Array, urgencies: jax.Array, inputs: BeamInputs) -> jax.Array:
+    """Logits `[..., K]` of the looks, azimuth index first: worths of searching and of tracks in the beam.
+
+    Args:
+        prices: `[..., 8]` of the rows of `inputs.search`.
+        urgencies: `[..., T]` of the tracks.
+        inputs: what lies in which beam.
+    """
+    searched = jnp.einsum("...j,...jk->...k", prices, inputs.search)
+    followed = jnp.sum(jnp.where(inputs.inside, urgencies[..., None], 0.0), axis=-2)
+    return LOGIT_SCALE * (searched + followed)
+
+
 class BeamNetwork(nn.Module):
     """Prices of searching from the whole picture, urgencies from every track, and a value."""
 
@@ -127,19 +172,14 @@ class BeamNetwork(nn.Module):
     def __call__(self, inputs: BeamInputs) -> tuple[jax.Array, jax.Array]:
         """Logits `[..., K]` over the looks (azimuth index first) and value `[...]`."""
         context = nn.relu(_dense(self.width, "context")(inputs.context))
-        tracks = _dense(self.width, "tracks")(inputs.tracks)
-        tracks += _dense(self.width, "tracks_in_context")(context)[..., None, :]
-        tracks = nn.relu(_dense(self.width, "hidden")(nn.relu(tracks)))
-        tracks = jnp.where(inputs.mask[..., None], tracks, 0.0)
-        picture = jnp.concatenate([tracks.mean(axis=-2), context], axis=-1)
+        urgencies, rows = TrackRows(self.width, name="rows")(inputs, context)
+        picture = jnp.concatenate([rows.mean(axis=-2), context], axis=-1)
 
-        urgencies = jnp.where(inputs.mask, _dense(1, "urgency", 0.01)(tracks)[..., 0], 0.0)
         priced = nn.relu(_dense(self.width, "picture")(picture))
-        prices = _dense(inputs.search.shape[-2], "prices", 0.01)(priced)
-        worth = jnp.einsum("...j,...jk->...k", prices, inputs.search)
-        worth += jnp.sum(jnp.where(inputs.inside, urgencies[..., None], 0.0), axis=-2)
+        prices = _dense(inputs.search.shape[-2], "prices", HEAD_GAIN)(priced)
+        logits = logits_of_looks(prices, urgencies, inputs)
         valued = nn.relu(_dense(2 * self.width, "valued")(picture))
-        return LOGIT_SCALE * worth, _dense(1, "value", 1.0)(valued)[..., 0]
+        return logits, _dense(1, "value", 1.0)(valued)[..., 0]
 
 
 def _dense(features: int, name: str, gain: float = 2**0.5) -> nn.Dense:

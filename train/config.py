@@ -9,7 +9,7 @@ from jaxtrack.cli import LARGEST_SEED
 from jaxtrack.params import Params, StaticParams, validate
 from jaxtrack.policies import POLICIES
 from train.agents import AGENTS
-from train.networks import ENCODERS
+from train.networks import ENCODERS, HEADS
 from train.vision import SMALLEST_MAP
 
 NO_WARM_START = "none"
@@ -25,6 +25,9 @@ class TrainConfig:
     encoder: str = "beams"
     """Policy to train: beams (what a beam would search and what the tracks in it need), or the
     paper's track-list encoders flatten, bigru, mhsa."""
+    head: str = "beams"
+    """How the paper's networks choose a look: beams (worths of what lies in each beam), joint (one
+    softmax over all looks), or factored (azimuth and elevation apart, as in the paper)."""
     total_steps: int = 800_000
     """Environment steps, rounded down to whole updates."""
     num_envs: int = 64
@@ -120,6 +123,9 @@ def check(config: TrainConfig) -> None:
     """
     if config.encoder not in AGENTS:
         raise ValueError(f"encoder = {config.encoder!r}: expected one of {', '.join(AGENTS)}")
+    _require(config, "head", config.head in HEADS, f"one of {', '.join(HEADS)}")
+    if config.encoder not in ENCODERS:
+        _require(config, "head", config.head == "beams", f"beams, the head of {config.encoder}")
     for name in _AT_LEAST_ONE:
         _require(config, name, getattr(config, name) >= 1, "an integer >= 1")
     teachers = (NO_WARM_START, *POLICIES)

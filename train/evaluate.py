@@ -152,15 +152,18 @@ def group_runs(runs: Sequence[tuple[Path, TrainConfig, Any]], greedy: bool) -> d
     encoders = [members[0][1].encoder for _, members in groups]
     competitors = {}
     for encoder, (_, members) in zip(encoders, groups, strict=True):
+        config = members[0][1]
         name = encoder if encoders.count(encoder) == 1 else f"{encoder} ({members[0][0].name})"
         seeds = tuple(config.seed for _, config, _ in members)
-        competitors[name] = agent(encoder, [weights for _, _, weights in members], seeds, greedy)
+        competitors[name] = agent(config, [weights for _, _, weights in members], seeds, greedy)
     return competitors
 
 
-def agent(encoder: str, weights: Sequence[Any], seeds: tuple[int, ...], greedy: bool = False) -> Competitor:
+def agent(
+    config: TrainConfig, weights: Sequence[Any], seeds: tuple[int, ...], greedy: bool = False
+) -> Competitor:
     """A trained policy, with weights for every training seed."""
-    return Competitor(lambda own: agent_policy(encoder, own, greedy), weights, seeds)
+    return Competitor(lambda own: agent_policy(config.encoder, own, greedy, config.head), weights, seeds)
 
 
 def play(

@@ -87,7 +87,7 @@ def init_learner(key: jax.Array, scenario: Params, env: SearchTrack, config: Tra
     The environments start at different times of their episode, so that a rollout holds all
     phases of an episode and their ends do not fall on one step.
     """
-    agent = build_agent(config.encoder, env.static, scenario)
+    agent = build_agent(config.encoder, env.static, scenario, config.head)
     key_env, key_net, key = jax.random.split(key, 3)
     keys = jax.random.split(key_env, config.num_envs)
     observation, state = jax.vmap(env.reset_env, in_axes=(0, None))(keys, scenario)
@@ -112,7 +112,7 @@ def train_step(
     state: LearnerState, env: SearchTrack, config: TrainConfig
 ) -> tuple[LearnerState, dict[str, jax.Array]]:
     """One update: a rollout of every environment, advantages, and PPO's epochs over them."""
-    agent = build_agent(config.encoder, env.static, state.scenario)
+    agent = build_agent(config.encoder, env.static, state.scenario, config.head)
     key, key_rollout, key_update = jax.random.split(jax.random.wrap_key_data(state.key), 3)
     state, rollout, rollout_metrics = collect(key_rollout, state, env, agent, config)
     samples = estimate_advantages(rollout, state, agent, config)

@@ -187,7 +187,7 @@ def finish(state: LearnerState, env: SearchTrack, run: Run, console: Console) ->
 
     started = time.perf_counter()
     config, folder = run.config, run.folder
-    competitor = agent(config.encoder, [state.weights], (config.seed,))
+    competitor = agent(config, [state.weights], (config.seed,))
     comparison = compare_with_baselines(
         config.encoder, competitor, env, config.params, run.evaluation_episodes, COMPARED_SEED, console
     )

@@ -45,11 +45,15 @@ def test_beams_have_one_logit_per_look():
 
 
 @pytest.mark.parametrize("name", ["flatten", "bigru", "mhsa"])
-def test_the_papers_networks_have_one_logit_per_index(name):
-    agent = build_agent(name, STATIC, PARAMS)
-    assert agent.network.encoder == name
-    assert agent.distribution is FACTORED
-    assert shapes(agent) == [(2, 2, 4), (2,)]
+@pytest.mark.parametrize(
+    ("head", "distribution", "logits"),
+    [("factored", FACTORED, (2, 2, 4)), ("joint", JOINT, (2, 16)), ("beams", JOINT, (2, 16))],
+)
+def test_the_papers_networks_take_every_head(name, head, distribution, logits):
+    agent = build_agent(name, STATIC, PARAMS, head)
+    assert (agent.network.encoder, agent.network.head) == (name, head)
+    assert agent.distribution is distribution
+    assert shapes(agent) == [logits, (2,)]
 
 
 def test_an_unknown_name_is_refused():

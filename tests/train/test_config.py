@@ -53,6 +53,13 @@ def test_counts_that_may_be_zero_are_not_negative(name):
     check(TrainConfig(**{**SMALL, name: 0}))
 
 
+def test_heads_are_known_and_the_beam_policy_has_one():
+    assert refusal(encoder="mhsa", head="cells") == "head = 'cells': expected one of beams, joint, factored"
+    assert refusal(head="joint") == "head = 'joint': expected beams, the head of beams"
+    for head in ("beams", "joint", "factored"):
+        check(TrainConfig(**{**SMALL, "encoder": "mhsa", "head": head}))
+
+
 @pytest.mark.parametrize("name", ["gamma", "gae_lambda"])
 def test_shares_lie_in_the_unit_interval(name):
     for value in (-0.1, 1.1, NAN):

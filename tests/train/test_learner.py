@@ -39,7 +39,8 @@ def traced(monkeypatch):
     """Lets the learner build the linear agent; counts how often it is traced."""
     names = []
 
-    def build(name, static, params):
+    def build(name, static, params, head="beams"):
+        assert head == "beams"
         names.append(name)
         return Agent(lambda observation: observation, Linear(), JOINT)
 

@@ -6,6 +6,8 @@ import numpy as np
 import optax
 import pytest
 
+from jaxtrack import Params, StaticParams
+from train.beams import BeamGeometry
 from train.distributions import FACTORED
 from train.networks import ENCODERS, PaperNetwork
 
@@ -86,6 +88,36 @@ def test_features_are_shared_and_the_two_mlps_are_not(apply, network, observatio
     assert outputs_that_depend_on("value") == [False, True]
 
 
+def test_a_joint_head_has_a_logit_for_every_look(observation):
+    network = PaperNetwork("flatten", head="joint")
+    logits, value = jax.eval_shape(
+        lambda key: network.init_with_output(key, observation)[0], jax.random.key(0)
+    )
+    assert (logits.shape, value.shape) == ((B, L * L), (B,))
+
+
+def test_the_beams_head_tells_what_lies_in_each_beam(apply, observation, draw_variables):
+    """Looks with the same in their beams have the same logit; a track changes those of its beams alone."""
+    static, params = StaticParams(max_tracks=T, num_looks=L), Params()
+    network = PaperNetwork("flatten", head="beams")
+    tracks = jnp.abs(observation["tracks"]) / 3  # a covariance has no negative norm
+    whole = {**observation, "tracks": tracks, "mask": jnp.ones((B, T), bool)}
+    beams = jax.jit(jax.vmap(BeamGeometry(static, params)))(whole)
+    variables = draw_variables(network, {**whole, "beams": beams})
+    logits, _ = apply(network, variables, {**whole, "beams": beams})
+    assert logits.shape == (B, L * L)
+    nowhere = {**whole, "beams": beams.replace(inside=beams.inside.at[:, 0].set(False))}
+    changed = np.asarray(apply(network, variables, nowhere)[0] != logits)
+    assert beams.inside[:, 0].any()
+    np.testing.assert_array_equal(changed, beams.inside[:, 0])
+    # No search: what is left are the tracks, and looks that hold none are all alike.
+    searched = beams.replace(search=jnp.zeros_like(beams.search))
+    rest = np.asarray(apply(network, variables, {**whole, "beams": searched})[0])
+    empty = ~np.asarray(beams.inside.any(axis=1))
+    np.testing.assert_array_equal(rest[empty], 0)
+    assert np.all(rest[~empty] != 0)
+
+
 def test_dimensions_of_the_paper(network):
     params = network[1]["params"]
     assert params["scan_map"]["Dense_0"]["kernel"].shape == (256, 128)
@@ -153,3 +185,8 @@ def test_learns_to_point_at_the_first_track(initialised):
 def test_unknown_encoder_is_refused_by_name(observation):
     with pytest.raises(ValueError, match=r"encoder = 'gru'.*flatten, bigru, mhsa"):
         PaperNetwork("gru").init(jax.random.key(0), observation)
+
+
+def test_unknown_head_is_refused_by_name(observation):
+    with pytest.raises(ValueError, match=r"head = 'cells'.*beams, joint, factored"):
+        PaperNetwork("flatten", head="cells").init(jax.random.key(0), observation)

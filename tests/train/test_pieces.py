@@ -27,7 +27,7 @@ def observations():
     mask = rng.random((len(USED), 8)) < 0.6
     mask &= np.arange(8) < USED[:, None]
     mask[np.arange(len(USED)), USED - 1] |= USED > 0
-    tracks = np.where(mask[..., None], rng.normal(size=(*mask.shape, 7)), np.nan)
+    tracks = np.where(mask[..., None], rng.uniform(size=(*mask.shape, 7)), np.nan)
     scan_map = rng.random((len(USED), 36, 36))
     return jax.tree.map(jnp.asarray, {
         "tracks": tracks.astype(np.float32), "mask": mask, "scan_map": scan_map.astype(np.float32)
@@ -42,10 +42,10 @@ def minibatch(inputs):
     return Sample(inputs, action, jnp.zeros(len(USED), bool), log_prob, **numbers)
 
 
-@pytest.mark.parametrize("encoder", ["bigru", "mhsa"])
-def test_short_lists_change_neither_gradients_nor_outputs(draw_variables, encoder):
-    agent = build_agent(encoder, STATIC, Params())
-    inputs = observations()
+@pytest.mark.parametrize(("encoder", "head"), [("bigru", "factored"), ("mhsa", "beams")])
+def test_short_lists_change_neither_gradients_nor_outputs(draw_variables, encoder, head):
+    agent = build_agent(encoder, STATIC, Params(), head)
+    inputs = jax.jit(jax.vmap(agent.features))(observations())
     weights = draw_variables(agent.network, inputs)
     lengths = []
 
