@@ -11,9 +11,9 @@ _LANES = 16
 
 
 def draw(key: jax.Array, num_normal: int, num_uniform: int) -> tuple[jax.Array, jax.Array]:
-    """Standard normal numbers and numbers uniform in [0, 1), in one long draw; the key is consumed."""
+    """Standard normal numbers and numbers uniform in (0, 1), in one long draw; the key is consumed."""
     length = -(-(num_normal + num_uniform) // _LANES) * _LANES
-    numbers = stage(lambda key: _symmetric_uniform(key, length))(key)
+    numbers = jnp.concatenate(stage(lambda key: _symmetric_uniform(key, length))(key))
     normal = stage(lambda uniform: jnp.sqrt(2.0).astype(uniform.dtype) * jax.lax.erf_inv(uniform))
     return normal(numbers[:num_normal]), (numbers[num_normal : num_normal + num_uniform] + 1) / 2
 
@@ -32,10 +32,24 @@ def draw_index(key: jax.Array, time: jax.Array, number: int) -> jax.Array:
     return one_by_one(one)(key, time)
 
 
-def _symmetric_uniform(key: jax.Array, length: int) -> jax.Array:
-    """Uniform in (-1, 1), where the normal distribution's quantile is finite."""
-    one = jnp.ones(())
-    return jax.random.uniform(key, (length,), minval=jnp.nextafter(-one, one), maxval=one)
+def _symmetric_uniform(key: jax.Array, length: int) -> list[jax.Array]:
+    """Uniform in (-1, 1), where the normal distribution's quantile is finite: parts of `length` in all."""
+    if jnp.ones(()).dtype == jnp.float64:
+        return [_middle_of_cell(jax.random.bits(key, (length,), jnp.uint64))]
+    # A new key is two random words. `jax.random.bits` works out as much for each word that it returns.
+    words = jax.random.key_data(jax.random.split(key, length // 2))
+    return [_middle_of_cell(words[:, 0]), _middle_of_cell(words[:, 1])]
+
+
+def _middle_of_cell(bits: jax.Array) -> jax.Array:
+    """The middle of one of 2^23 (of 64 bits: 2^52) equal cells of (-1, 1).
+
+    Exact, and so is its place in (0, 1), half of it and a half: neither is ever an end of its interval.
+    """
+    kind, signed = (jnp.float32, jnp.int32) if bits.dtype == jnp.uint32 else (jnp.float64, jnp.int64)
+    unused = jnp.finfo(kind).bits - jnp.finfo(kind).nmant
+    cell = jax.lax.bitcast_convert_type(bits, signed) >> unused
+    return (cell.astype(kind) + 0.5) * 2.0 ** (1 - jnp.finfo(kind).nmant)
 
 
 def poisson_quantile(uniform: jax.Array, rate: Scalar, largest: int) -> jax.Array:

@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from jaxtrack import sampling
+from jaxtrack.episode import sample_step_noise
 from jaxtrack.sampling import draw, draw_index, first_largest, matches, places, poisson_quantile, split
 
 
@@ -20,7 +22,7 @@ def test_draws_follow_their_laws_and_are_independent():
     assert uniform.shape == (3001,)
     assert stats.kstest(normal, "norm").pvalue > 0.01
     assert stats.kstest(uniform, "uniform").pvalue > 0.01
-    assert 0 <= float(uniform.min()) <= float(uniform.max()) < 1
+    assert 0 < float(uniform.min()) <= float(uniform.max()) < 1
     assert abs(np.corrcoef(normal[:3000], uniform[:3000])[0, 1]) < 0.05
 
 
@@ -31,6 +33,92 @@ def test_draws_depend_on_the_key_and_on_nothing_else():
     assert not np.any(first[0] == other[0])
     together = jax.vmap(lambda key: draw(key, 5, 3))(keys)
     np.testing.assert_allclose(together[1], [first[1], other[1]], rtol=1e-6)
+
+
+def numbers_of_many_keys(number):
+    """Numbers `[K, number]`, uniform in (0, 1), of keys that follow one another as those of an episode."""
+    keys = jax.random.split(jax.random.key(4), 4000)
+    return np.asarray(jax.jit(jax.vmap(lambda key: draw(key, 0, number)[1]))(keys), dtype=float)
+
+
+@pytest.fixture(scope="module")
+def of_many_keys():
+    return numbers_of_many_keys(32)
+
+
+def test_every_place_of_a_draw_is_uniform(of_many_keys):
+    smallest = min(stats.kstest(column, "uniform").pvalue for column in of_many_keys.T)
+    assert smallest > 0.01 / of_many_keys.shape[1]
+    counts = np.bincount((of_many_keys.ravel() * 2**10).astype(int), minlength=2**10)
+    assert stats.chisquare(counts).pvalue > 0.01
+
+
+def bits_of(uniform, number):
+    """`[..., number]` the leading bits of numbers `[...]`."""
+    return (uniform[..., None] * 2.0 ** np.arange(1, number + 1)).astype(int) & 1
+
+
+def test_every_bit_of_the_numbers_is_as_often_on_as_off(of_many_keys):
+    share = np.mean(bits_of(of_many_keys, 23), axis=(0, 1))
+    np.testing.assert_allclose(share, 0.5, atol=4.5 * 0.5 / np.sqrt(of_many_keys.size))
+
+
+def test_the_places_of_a_draw_are_independent(of_many_keys):
+    """Of one key: halves of a draw are worked out together. And of the next key."""
+    now, following = of_many_keys[:-1], of_many_keys[1:]
+    number, places_ = now.shape
+    together = np.corrcoef(np.concatenate([now, following], axis=1).T)[:places_]
+    together[np.eye(*together.shape, dtype=bool)] = 0
+    assert np.abs(together).max() < 5 / np.sqrt(number)
+
+
+def test_the_bits_of_the_halves_of_a_draw_are_independent(of_many_keys):
+    """Every bit of every other: a number may be one of the other half turned round, unseen by correlation."""
+    first, second = (half.reshape(-1, 23) for half in np.split(bits_of(of_many_keys, 23), 2, axis=1))
+    together = np.corrcoef(first.T, second.T)[:23, 23:]
+    assert np.abs(together).max() < 4.5 / np.sqrt(len(first))
+
+
+def test_no_more_numbers_are_equal_than_by_chance(of_many_keys):
+    """All 128,000 among one another: places, steps. Of 2^23 cells, every pair falls into one."""
+    by_chance = stats.poisson(of_many_keys.size * (of_many_keys.size - 1) / 2 / 2**23)
+    _, counts = np.unique(of_many_keys, return_counts=True)
+    assert by_chance.cdf(np.sum(counts * (counts - 1) / 2)) < 0.999
+
+
+def test_no_more_noise_is_equal_between_steps_and_environments_than_by_chance(static):
+    """Keys of steps and environments as `play_episodes` takes them."""
+    keys = jax.vmap(lambda key: jax.random.split(key, 50))(jax.random.split(jax.random.key(5), 40))
+    noise = jax.jit(jax.vmap(jax.vmap(lambda key: sample_step_noise(key, static))))(keys)
+    for name, leaf in (("motion", noise.truths.motion), ("detected", noise.sensor.detected)):
+        rows = np.asarray(leaf).reshape(2000, -1)
+        by_chance = stats.poisson(2000 * 1999 / 2 / 2**23)
+        for place in rows.T:
+            _, counts = np.unique(place, return_counts=True)
+            assert by_chance.cdf(np.sum(counts * (counts - 1) / 2)) < 1 - 1e-5, name
+
+
+def test_the_ends_of_the_interval_are_never_drawn():
+    words = jnp.array([0, 2**31 - 1, 2**31, 2**32 - 1], dtype=jnp.uint32)
+    numbers = sampling._middle_of_cell(words)
+    half = 2.0**-23
+    np.testing.assert_array_equal(numbers, [half, 1 - half, half - 1, -half])
+    np.testing.assert_array_equal((numbers + 1) / 2, [0.5 + half / 2, 1 - half / 2, half / 2, 0.5 - half / 2])
+    assert np.all(np.isfinite(jax.scipy.special.erfinv(numbers)))
+
+
+def test_the_ends_of_the_interval_are_never_drawn_in_double_precision_either(x64):
+    words = jnp.array([0, 2**63 - 1, 2**63, 2**64 - 1], dtype=jnp.uint64)
+    numbers = sampling._middle_of_cell(words)
+    assert numbers.dtype == jnp.float64
+    half = 2.0**-52
+    np.testing.assert_array_equal(numbers, [half, 1 - half, half - 1, -half])
+    np.testing.assert_array_equal((numbers + 1) / 2, [0.5 + half / 2, 1 - half / 2, half / 2, 0.5 - half / 2])
+    normal, uniform = jax.jit(draw, static_argnums=(1, 2))(jax.random.key(0), 4000, 3000)
+    assert stats.kstest(normal, "norm").pvalue > 0.01
+    assert stats.kstest(uniform, "uniform").pvalue > 0.01
+    share = np.mean(bits_of(np.asarray(uniform), 52), axis=0)
+    np.testing.assert_allclose(share, 0.5, atol=4.5 * 0.5 / np.sqrt(3000))
 
 
 def test_draws_have_the_precision_asked_for(x64):
