@@ -21,6 +21,7 @@ from jaxtrack.observation import variances
 from jaxtrack.params import Params, StaticParams
 from jaxtrack.sampling import draw_index, first_largest
 from jaxtrack.scan_map import beam_means, beam_sizes, look_grid
+from jaxtrack.search_plan import search_plan
 from jaxtrack.sensor import in_beams, look_number
 from jaxtrack.types import Tracks, position
 
@@ -148,6 +149,7 @@ def gain(
     variance_scale: float = 1000.0,
     danger_weight: float = 3.0,
     danger_exponent: int = 8,
+    planned: bool = False,
 ) -> Policy:
     """The look with the largest gain.
 
@@ -164,10 +166,12 @@ def gain(
         variance_scale: removed variance that is worth as much as a beam of field never seen (m^2).
         danger_weight: worth of a track that is about to be deleted.
         danger_exponent: power of trace / deletion threshold.
+        planned: the look whose turn it is in the search plan finds as much as the best.
     """
     looks, sizes = look_grid(static, params), beam_sizes(static, params)
     areas = (sizes / jnp.median(sizes)) ** area_exponent
     scan_values = beam_means(static, params)
+    plan = search_plan(static, params) if planned else None
 
     def policy(key: jax.Array, state: "EnvState") -> jax.Array:
         del key
@@ -176,8 +180,9 @@ def gain(
         removed = removed_variance(variances(tracks)[:, 0], distance, params)
         danger = trace_share(tracks, params) ** danger_exponent
         need = removed / variance_scale + danger_weight * danger
-        unseen = areas * scan_values(state.scan_map**sharpness)
-        return to_action(first_largest(unseen + sum_in_beams(need, tracks, looks, params)), static, params)
+        unseen = scan_values(state.scan_map**sharpness)
+        found = plan.prefer_next(areas * unseen, unseen) if plan else areas * unseen
+        return to_action(first_largest(found + sum_in_beams(need, tracks, looks, params)), static, params)
 
     return policy
 
@@ -197,6 +202,7 @@ POLICIES: dict[str, PolicyBuilder] = {
         position_weight=TUNED_POSITION_WEIGHT,
     ),
     "gain": gain,
+    "sweep": partial(gain, planned=True),
 }
 
 

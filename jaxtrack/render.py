@@ -153,7 +153,7 @@ class Options:
     """Plays one episode and draws it."""
 
     policy: str = "index"
-    """Policy by name: random, static, coverage, stalest, scheduler, index, index_tuned or gain."""
+    """Policy by name: random, static, coverage, stalest, scheduler, index, index_tuned, gain or sweep."""
     seed: int = 0
     """Seed of the scenario and of the policy."""
     steps: int = 1000

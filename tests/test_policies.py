@@ -11,6 +11,8 @@ from jaxtrack import Params, StaticParams, Tracks, Truths
 from jaxtrack.env import SearchTrack
 from jaxtrack.episode import EnvState
 from jaxtrack.policies import POLICIES, REVISIT_SHARE, gain, index, scheduler
+from jaxtrack.scan_map import initial_scan_map, update_scan_map
+from jaxtrack.search_plan import search_plan
 from jaxtrack.sensor import look_angles
 
 pytestmark = pytest.mark.usefixtures("quick_compilation")
@@ -246,6 +248,21 @@ def test_gain_takes_the_look_that_finds_most_field_unseen_and_helps_the_tracks_m
         assert any(need[tuple(look)] < need.max() for look, ((_, need), _) in zip(chosen, gains, strict=True))
     else:
         assert chosen != [largest(unseen + need) for _, (unseen, need) in gains]
+
+
+def test_sweep_follows_the_search_plan_where_it_has_no_tracks():
+    plan = jax.jit(search_plan, static_argnums=0)(STATIC, PARAMS)
+    policy = jax.jit(POLICIES["sweep"](STATIC, PARAMS))
+    state, order = scene(0), np.argsort(plan.turn).tolist()
+    state = state.replace(tracks=Tracks.empty(T), scan_map=initial_scan_map(STATIC))
+    for turn in range(6):
+        action = policy(jax.random.key(0), state)
+        assert action.tolist() == list(divmod(order[turn], L))
+        look = look_angles(action, STATIC, PARAMS)
+        state = state.replace(scan_map=update_scan_map(state.scan_map, look, STATIC, PARAMS))
+    # Urgent tracks come first, as by the rule without a plan.
+    urgent = scene(0).replace(scan_map=initial_scan_map(STATIC))
+    assert policy(jax.random.key(0), urgent).tolist() == act("gain", urgent)
 
 
 def with_share(share, azimuth, elevation):

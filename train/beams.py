@@ -16,6 +16,7 @@ from jaxtrack.observation import Observation
 from jaxtrack.params import Params, StaticParams
 from jaxtrack.policies import removed_variance
 from jaxtrack.scan_map import beam_means, beam_sizes, look_grid
+from jaxtrack.search_plan import search_plan
 from jaxtrack.sensor import in_beams, look_number
 from train.orthogonal import orthogonal
 
@@ -43,10 +44,11 @@ class BeamInputs(struct.PyTreeNode):
     """What the beam network reads, K = L * L looks.
 
     Attributes:
-        search: `[..., 8, K]` of every look: mean scan value s in its beam; mean u of the scan values
+        search: `[..., 9, K]` of every look: mean scan value s in its beam; mean u of the scan values
             to the power of `SHARPNESS`; u times the root of a, and u times a, the pixels in the beam
             per largest number of them; mean n of u over the eight looks around it, 0 outside the
-            field; u times n; its azimuth and elevation, per limit of the field.
+            field; u times n; its azimuth and elevation, per limit of the field; the largest u times root
+            of a, at the look whose turn it is in the search plan alone.
         inside: `[..., T, K]` whether a track lies in the beam of a look.
         tracks: `[..., T, F]` the observation's features, the root of the covariance norm, s of the
             look nearest to the track, and where variances are observed: them and their roots, the
@@ -56,7 +58,7 @@ class BeamInputs(struct.PyTreeNode):
             mean, mean root and maximum of the covariance norms.
     """
 
-    search: jax.Array  # [..., 8, K]
+    search: jax.Array  # [..., 9, K]
     inside: jax.Array  # [..., T, K] bool
     tracks: jax.Array  # [..., T, F]
     mask: jax.Array  # [..., T] bool
@@ -81,6 +83,7 @@ class BeamGeometry:
         self.scan_values = beam_means(static, params)
         sizes = beam_sizes(static, params)
         self.areas = sizes / sizes.max()
+        self.plan = search_plan(static, params)
 
     def __call__(self, observation: Observation) -> BeamInputs:
         """Inputs of one observation (no batch dimension)."""
@@ -113,8 +116,10 @@ class BeamGeometry:
     def _search(self, scan_value: jax.Array, unseen: jax.Array) -> jax.Array:
         around = mean_of_neighbours(unseen.reshape(self.static.num_looks, -1)).ravel()
         places = self.looks.T / self.params.field_limit
-        own = [scan_value, unseen, unseen * jnp.sqrt(self.areas), unseen * self.areas]
-        return jnp.stack([*own, around, unseen * around, *places])
+        worth = unseen * jnp.sqrt(self.areas)
+        planned = jnp.where(self.plan.next_look(unseen), jnp.max(worth), 0.0)
+        own = [scan_value, unseen, worth, unseen * self.areas]
+        return jnp.stack([*own, around, unseen * around, *places, planned])
 
     def _context(self, norm: jax.Array, mask: jax.Array, scan_map: jax.Array) -> jax.Array:
         number = jnp.maximum(mask.sum(), 1)
@@ -154,7 +159,7 @@ def logits_of_looks(prices: jax.Array, urgencies: jax.Array, inputs: BeamInputs)
     """Logits `[..., K]` of the looks, azimuth index first: worths of searching and of tracks in the beam.
 
     Args:
-        prices: `[..., 8]` of the rows of `inputs.search`.
+        prices: `[..., 9]` of the rows of `inputs.search`.
         urgencies: `[..., T]` of the tracks.
         inputs: what lies in which beam.
     """

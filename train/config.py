@@ -28,7 +28,7 @@ class TrainConfig:
     head: str = "beams"
     """How the paper's networks choose a look: beams (worths of what lies in each beam), joint (one
     softmax over all looks), or factored (azimuth and elevation apart, as in the paper)."""
-    total_steps: int = 800_000
+    total_steps: int = 400_000
     """Environment steps, rounded down to whole updates."""
     num_envs: int = 64
     """Environments that run side by side."""
@@ -41,7 +41,7 @@ class TrainConfig:
     checkpoint_every: int = 20
     """Updates between checkpoints; one is always written at the end."""
 
-    warm_start: str = "gain"
+    warm_start: str = "sweep"
     """Rule that the policy imitates at first, a baseline by name; none: it learns from rewards alone."""
     warm_start_steps: int = 150_000
     """Environment steps of that, out of the total, rounded down to whole updates."""

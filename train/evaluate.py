@@ -49,7 +49,7 @@ class EvaluateOptions:
 
     policies: tuple[str, ...] = (ALL,)
     """Names of baselines: random, static, coverage, stalest, scheduler, index, index_tuned, gain,
-    or "all";
+    sweep, or "all";
     and of planners: greedy, rollout, uncertainty, or "planners". No name after the option for none."""
     runs: Annotated[tuple[Path, ...], tyro.conf.arg(aliases=["--run"])] = ()
     """Folders of trained runs; runs that differ in nothing but their seed are one policy."""

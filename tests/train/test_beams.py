@@ -7,6 +7,7 @@ import pytest
 
 from jaxtrack import Params, StaticParams
 from jaxtrack.scan_map import beam_weights
+from jaxtrack.search_plan import search_plan
 from train.beams import BeamGeometry, BeamInputs, BeamNetwork, mean_of_neighbours
 
 pytestmark = pytest.mark.usefixtures("quick_compilation")
@@ -73,9 +74,19 @@ def test_observed_variances_and_their_roots_are_features(features):
     assert not wider.tracks[2:].any()
 
 
+def turns():
+    """Turns of the looks in the search plan."""
+    return np.asarray(jax.jit(search_plan, static_argnums=0)(STATIC, PARAMS).turn)
+
+
 def test_what_a_beam_would_search(features):
+    inputs = features(observe(seen=False))
+    assert np.flatnonzero(inputs.search[-1]).tolist() == np.flatnonzero(turns() == 0).tolist()
+    assert inputs.search[-1].max() == inputs.search[2].max()
     inputs = features(observe())
-    scan, unseen, by_root, by_area, around, product, azimuth, elevation = np.asarray(inputs.search)
+    scan, unseen, by_root, by_area, around, product, azimuth, elevation, planned = np.asarray(inputs.search)
+    assert np.count_nonzero(planned) == 1
+    assert planned.max() == by_root.max()
     scan_map = np.asarray(observe()["scan_map"])
     # The look straight ahead holds the middle pixel and its eight neighbours.
     np.testing.assert_allclose(scan[CENTRE], scan_map[3:6, 3:6].mean(), rtol=1e-5)
