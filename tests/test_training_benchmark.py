@@ -7,21 +7,13 @@ import sys
 from pathlib import Path
 from types import SimpleNamespace
 
-import jax
-import numpy as np
 import pytest
 
 from benchmarks import time_to_gospa, training
-from benchmarks.ppo import OurLearner, Seconds, configure
+from benchmarks.ppo import Seconds
 from benchmarks.training import TrainingOptions, Turn
-from jaxtrack import Params, StaticParams
-from jaxtrack.env import make
+from jaxtrack import StaticParams
 from jaxtrack.report import PACKAGES
-from train.agents import build_agent
-from train.config import TrainConfig
-from train.episodes import compare
-from train.evaluate import COMPARED_SEED, agent
-from train.networks import ENCODERS
 
 pytestmark = pytest.mark.usefixtures("quick_compilation")
 
@@ -227,129 +219,6 @@ def test_without_the_extra_the_command_says_in_one_line_what_to_install(missing)
     assert line.startswith("error: ")
     assert 'pip install -e ".[sb3,reference]"' in line
     assert done.stdout == ""
-
-
-def test_without_a_warm_start_the_rate_is_the_advised_one():
-    assert time_to_gospa.configure("gain", 800_000, 0) == TrainConfig()
-    alone = time_to_gospa.configure("none", 2_000_000, 3)
-    assert alone == TrainConfig(warm_start="none", total_steps=2_000_000, seed=3, learning_rate=3e-3)
-
-
-@pytest.mark.parametrize(("goal", "reached", "updates"), [(120.0, True, 3), (90.0, False, 4)])
-def test_training_ends_at_the_first_evaluation_that_is_good_enough(monkeypatch, goal, reached, updates):
-    config = TrainConfig(num_envs=2, rollout_steps=4, num_minibatches=1, total_steps=32)
-    done = []
-
-    def build(config, env):
-        return OurLearner(SimpleNamespace(weights=0), lambda state: (done.append(1), {}), Seconds(1.0, 1.0))
-
-    def evaluation(config, env, weights):
-        other = {COMPARED_SEED: 130.0}
-        return lambda weights, seed: other.get(seed, [200.0, 121.0, 119.0, 100.0][len(done) - 1])
-
-    monkeypatch.setattr(time_to_gospa, "build_learner", build)
-    monkeypatch.setattr(OurLearner, "__call__", lambda self: done.append(1))
-    monkeypatch.setattr(time_to_gospa, "compile_evaluation", evaluation)
-    found = time_to_gospa.train_until(goal, config)
-    assert (found["reached"], len(done)) == (reached, updates)
-    assert found["env_steps"] == 8 * updates
-    assert [each["env_steps"] for each in found["evaluations"]] == [8, 16, 24, 32][:updates]
-    assert found["gospa"] == [200.0, 121.0, 119.0, 100.0][updates - 1]
-    assert found["gospa_on_other_scenarios"] == 130.0
-    assert 0 < found["compile_seconds"] <= found["evaluations"][0]["seconds"] <= found["seconds"]
-
-
-def test_the_evaluation_is_that_of_train_evaluate():
-    static = StaticParams(num_truths=2, max_tracks=3, max_detections=2, map_size=8, num_looks=5)
-    static = dataclasses.replace(static, observe_variances=True)
-    params = Params(max_steps_in_episode=12)
-    config = TrainConfig(static=static, params=params)
-    env, _ = make(params, static)
-    keys = jax.random.split(jax.random.key(1), 2)
-    observations = jax.vmap(env.reset_env, in_axes=(0, None))(keys, params)[0]
-    beams = build_agent("beams", static, params)
-    weights = beams.network.init(jax.random.key(0), jax.vmap(beams.features)(observations))
-    evaluate = time_to_gospa.compile_evaluation(config, env, weights)
-    competitor = agent("beams", [weights], (0,))
-    expected = compare({"beams": competitor}, env, params, time_to_gospa.EPISODES, seed=3).played["beams"]
-    assert evaluate(weights, 3) == pytest.approx(expected.values["gospa"].mean(), rel=1e-5)
-    assert evaluate(weights, 4) != evaluate(weights, 3)
-
-
-@pytest.fixture(scope="module")
-def stone_soup_ppo():
-    """A small learner on Stone Soup after its warm-up."""
-    from benchmarks.stone_soup_ppo import StoneSoupPPO
-
-    config = dataclasses.replace(configure("flatten", SMALL), num_envs=2, rollout_steps=16)
-    learner = StoneSoupPPO(config, piece=4)
-    learner.warm_up(6)
-    return learner
-
-
-@pytest.mark.sb3
-def test_stone_soup_steps_in_pieces_and_learns_from_a_full_batch(stone_soup_ppo, monkeypatch):
-    model = stone_soup_ppo.model
-    assert model.num_timesteps == 2 * 8  # six steps are two pieces of four
-    scenarios = [env.unwrapped.scenario for env in model.env.envs]
-    assert [scenario.step_index for scenario in scenarios] == [8, 8]
-    seconds = stone_soup_ppo.collect()
-    assert seconds.wall > 0
-    assert [scenario.step_index for scenario in scenarios] == [12, 12]
-    counts = [len(scenario.tracks) for scenario in scenarios]
-    assert 0 <= stone_soup_ppo.tracks.mean <= max(counts) + 1
-
-    optimiser_steps, weights = [], {name: value.clone() for name, value in model.policy.named_parameters()}
-    step = model.policy.optimizer.step
-    monkeypatch.setattr(model.policy.optimizer, "step", lambda: (optimiser_steps.append(1), step()))
-    stone_soup_ppo.update()
-    assert len(optimiser_steps) == SMALL.epochs * SMALL.samples // SMALL.minibatch_size
-    assert any((value != weights[name]).any() for name, value in model.policy.named_parameters())
-
-
-@pytest.mark.sb3
-def test_the_full_batch_is_the_last_piece_again_and_again(stone_soup_ppo):
-    stone_soup_ppo.collect()
-    batch, rollout = stone_soup_ppo._full_batch(), stone_soup_ppo._rollout
-    assert (batch.full, batch.buffer_size, batch.n_envs) == (True, 16, 2)
-    assert stone_soup_ppo.pieces == 4
-    for step in range(16):
-        for name in ("actions", "log_probs", "advantages", "returns", "values", "rewards"):
-            np.testing.assert_array_equal(getattr(batch, name)[step], getattr(rollout, name)[step % 4])
-        for name, values in batch.observations.items():
-            np.testing.assert_array_equal(values[step], rollout.observations[name][step % 4])
-    assert np.abs(rollout.advantages).max() > 0
-    assert rollout.observations["scan_map"].shape == (4, 2, 1, 48, 48)
-
-
-@pytest.mark.sb3
-def test_live_tracks_come_first_in_their_order():
-    from benchmarks.stone_soup_ppo import for_the_network
-
-    mask = np.array([0, 1, 0, 1, 1], np.int8)
-    tracks = mask[:, None] * np.arange(5.0)[:, None]
-    shown = for_the_network({"tracks": tracks, "mask": mask, "scan_map": np.ones((3, 3))})
-    assert shown["mask"].tolist() == [1, 1, 1, 0, 0]
-    assert shown["tracks"][:, 0].tolist() == [1, 3, 4, 0, 0]
-    assert shown["scan_map"].shape == (1, 3, 3)
-
-
-@pytest.mark.sb3
-@pytest.mark.parametrize("encoder", ENCODERS)
-def test_both_networks_have_the_same_number_of_parameters(encoder):
-    """But for PyTorch's second bias of the gates r and z, which a GRU adds to the first."""
-    from benchmarks.stone_soup_ppo import StoneSoupPPO
-
-    config = configure(encoder, SMALL)
-    network = build_agent(encoder, config.static, config.params).network
-    env, _ = make(config.params, config.static)
-    observation = jax.eval_shape(env.reset_env, jax.random.key(0), config.params)[0]
-    one = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct((1, *leaf.shape), leaf.dtype), observation)
-    weights = jax.eval_shape(network.init, jax.random.key(0), one)
-    ours = OurLearner(SimpleNamespace(weights=weights), None, Seconds(0.0, 0.0)).parameters
-    second_biases = 2 * 2 * {"flatten": 0, "bigru": 64, "mhsa": 32}[encoder]
-    assert StoneSoupPPO(config, piece=4).parameters == ours + second_biases
-    assert ours > 100_000
 
 
 @pytest.mark.sb3
