@@ -2,9 +2,7 @@
 
 import dataclasses
 import sys
-import time
 from collections.abc import Callable, Sequence
-from pathlib import Path
 from types import ModuleType
 from typing import Any
 
@@ -12,132 +10,54 @@ import jax
 from rich.console import Console
 from rich.progress import Progress
 
+from benchmarks.ppo import REPORTED, UpdateOptions, build_learner, check_update, configure, load, seconds_of
 from benchmarks.still_world import StillWorld
-from jaxtrack.cli import parse, require_file, require_integer, run
+from jaxtrack.cli import parse, run
 from jaxtrack.params import Params, StaticParams
-from jaxtrack.report import PACKAGES, circumstances, print_table, spread, write_report
-from train import learner
+from jaxtrack.report import circumstances, print_table, spread, write_report
 from train.config import TrainConfig
-from train.networks import ENCODERS
-
-ALSO_REPORTED = ("flax", "optax", "stable-baselines3", "torch")
 
 
 @dataclasses.dataclass(frozen=True)
-class LearnerOptions:
+class LearnerOptions(UpdateOptions):
     """Times our PPO and Stable-Baselines3's with the same networks and sizes, in turns.
 
     One update is a rollout with inference only, on an environment that costs nothing, and PPO's
     epochs. Needs the extra sb3.
     """
 
-    encoders: tuple[str, ...] = tuple(ENCODERS)
-    """Track-list encoders of the paper: flatten, bigru, mhsa."""
-    num_envs: int = 64
-    """Environments side by side."""
-    rollout_steps: int = 128
-    """Steps of every environment in one update."""
-    minibatch_size: int = 1024
-    """Samples per optimiser step."""
-    epochs: int = 4
-    """Passes over the samples of an update."""
     live_tracks: tuple[int, int] = (5, 10)
     """Fewest and most live tracks in an observation of 20 slots; in between, all are equally frequent."""
-    repeats: int = 5
-    """Times that everything is timed."""
-    seed: int = 0
-    """Seed of the observations and of both learners."""
-    out: Path | None = None
-    """JSON file for the results; nothing is written without it."""
-    markdown: bool = False
-    """Print the table in Markdown."""
 
 
-Update = Callable[[], None]
+Update = Callable[[], Any]
 """One update of a learner that keeps its state to itself."""
 
 
 def check(options: LearnerOptions) -> None:
     """Raises ValueError, naming the option, before anything is measured."""
-    for name in ("num_envs", "rollout_steps", "minibatch_size", "epochs", "repeats"):
-        require_integer(name, getattr(options, name), 1)
+    check_update(options)
     (fewest, most), slots = options.live_tracks, StaticParams().max_tracks
     if not 0 <= fewest <= most <= slots:
         raise ValueError(
             f"live_tracks = {options.live_tracks}: expected two integers in order in [0, {slots}]"
         )
-    require_integer("seed", options.seed, 0)
-    known = ", ".join(ENCODERS)
-    if not options.encoders or len(set(options.encoders)) < len(options.encoders):
-        raise ValueError(f"encoders = {options.encoders}: expected different ones of {known}")
-    for encoder in options.encoders:
-        if encoder not in ENCODERS:
-            raise ValueError(f"encoders = {encoder!r}: expected some of {known}")
-    samples = options.num_envs * options.rollout_steps
-    if samples % options.minibatch_size:
-        raise ValueError(
-            f"minibatch_size = {options.minibatch_size}: expected a divisor of "
-            f"num_envs x rollout_steps = {samples} samples"
-        )
-    if options.out is not None:
-        require_file("out", options.out)
 
 
 def load_stable_baselines3() -> ModuleType:
-    """The other side, imported only here: it loads PyTorch.
+    """The other side.
 
     Raises:
         ValueError: where the extra is missing.
     """
-    try:
-        from benchmarks import torch_learner
-    except ImportError as error:
-        raise ValueError(f'{error.name} is not installed: pip install -e ".[sb3]"') from None
-    return torch_learner
-
-
-def configure(encoder: str, options: LearnerOptions) -> TrainConfig:
-    """The configuration of both learners; what is not an option is a default of `train.ppo`."""
-    samples = options.num_envs * options.rollout_steps
-    return TrainConfig(
-        encoder=encoder,
-        head="factored",
-        num_envs=options.num_envs,
-        rollout_steps=options.rollout_steps,
-        num_minibatches=samples // options.minibatch_size,
-        epochs=options.epochs,
-        seed=options.seed,
-        warm_start="none",
-        anneal=False,
-        static=StaticParams(),
-        params=Params(),
-    )
+    return load("benchmarks.torch_learner", "sb3")
 
 
 def build_ours(config: TrainConfig, live_tracks: tuple[int, int]) -> tuple[Update, dict[str, Any], float]:
     """Our learner, the observations that it sees, and the seconds that compiling its update took."""
-    env: Any = StillWorld(config.static, live_tracks)
-    init = jax.jit(lambda key, params: learner.init_learner(key, params, env, config))
-    state = init(jax.random.key(config.seed), config.params)
-    observations = jax.device_get(state.env.observation)
-    began = time.perf_counter()
-    step = jax.jit(lambda state: learner.train_step(state, env, config), donate_argnums=0)
-    compiled = step.lower(state).compile()
-    seconds = time.perf_counter() - began
-
-    def update() -> None:
-        nonlocal state
-        state, metrics = compiled(state)
-        jax.block_until_ready((state, metrics))
-
-    return update, observations, seconds
-
-
-def seconds_of(update: Update) -> float:
-    """Seconds that one call takes."""
-    began = time.perf_counter()
-    update()
-    return time.perf_counter() - began
+    ours = build_learner(config, StillWorld(config.static, live_tracks))
+    observations = jax.device_get(ours.state.env.observation)
+    return ours, observations, ours.compiling.wall
 
 
 def measure(options: LearnerOptions, progress: Progress) -> list[dict[str, Any]]:
@@ -162,10 +82,9 @@ def measure(options: LearnerOptions, progress: Progress) -> list[dict[str, Any]]
     taken: dict[str, list[tuple[float, ...]]] = {encoder: [] for encoder in options.encoders}
     for _ in range(options.repeats):
         for encoder in options.encoders:
-            taken[encoder].append(tuple(map(seconds_of, sides[encoder])))
+            taken[encoder].append(tuple(seconds_of(side).wall for side in sides[encoder]))
             progress.advance(task)
-    samples = options.num_envs * options.rollout_steps
-    return [make_row(encoder, samples, taken[encoder], compile_seconds[encoder]) for encoder in sides]
+    return [make_row(encoder, options.samples, taken[encoder], compile_seconds[encoder]) for encoder in sides]
 
 
 def make_row(
@@ -201,7 +120,7 @@ def main(argv: Sequence[str]) -> int:
     options = parse(LearnerOptions(), argv, "python -m benchmarks.learner")
     check(options)
     threads = load_stable_baselines3().threads()
-    report = circumstances((*PACKAGES, *ALSO_REPORTED))
+    report = circumstances(REPORTED)
     console = Console(width=None if sys.stdout.isatty() else 150)
     with Progress(console=console, disable=not console.is_terminal) as progress:
         rows = measure(options, progress)

@@ -1,7 +1,7 @@
 """The paper's networks in PyTorch, and Stable-Baselines3's PPO on an environment that costs nothing.
 
 Written as one would for Stable-Baselines3, from PyTorch's own layers. Needs the extra `sb3`;
-only `benchmarks.learner` and a test import it.
+only benchmarks beside Stable-Baselines3 and their tests import it.
 """
 
 from collections.abc import Callable
@@ -16,7 +16,6 @@ from stable_baselines3.common.vec_env import VecEnv
 from torch import nn
 from torch.nn.utils.rnn import pack_padded_sequence
 
-from jaxtrack.params import StaticParams
 from train.config import TrainConfig
 
 Arrays = dict[str, np.ndarray]
@@ -160,19 +159,23 @@ class StillVecEnv(VecEnv):
         return [False] * self.num_envs
 
 
-def build_ppo(config: TrainConfig, observations: Arrays) -> PPO:
+def still_env(observations: Arrays, num_looks: int) -> StillVecEnv:
+    """`StillVecEnv` with observations as jaxtrack has them: `scan_map` is `[B, M, M]`."""
+    arrays = {name: values.astype(np.float32) for name, values in observations.items()}
+    return StillVecEnv({**arrays, "scan_map": arrays["scan_map"][:, None]}, num_looks)
+
+
+def build_ppo(config: TrainConfig, env: VecEnv) -> PPO:
     """Stable-Baselines3's PPO with the paper's network and the numbers of `config`.
 
     Args:
         config: of our learner.
-        observations: as jaxtrack has them, one for each environment: `scan_map` is `[B, M, M]`.
+        env: observations `tracks`, `mask`, and `scan_map` with one channel; track lists with the live
+            ones first.
     """
-    static: StaticParams = config.static
-    arrays = {name: values.astype(np.float32) for name, values in observations.items()}
-    arrays["scan_map"] = arrays["scan_map"][:, None]
     return PPO(
         "MultiInputPolicy",
-        StillVecEnv(arrays, static.num_looks),
+        env,
         n_steps=config.rollout_steps,
         batch_size=config.minibatch_size,
         n_epochs=config.epochs,
@@ -196,7 +199,7 @@ def build_ppo(config: TrainConfig, observations: Arrays) -> PPO:
 
 def build_update(config: TrainConfig, observations: Arrays) -> Callable[[], None]:
     """One update of `build_ppo`'s learner: a rollout and the epochs over it."""
-    model = build_ppo(config, observations)
+    model = build_ppo(config, still_env(observations, config.static.num_looks))
 
     def update() -> None:
         model.learn(config.batch_size, reset_num_timesteps=False)

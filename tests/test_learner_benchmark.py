@@ -17,6 +17,7 @@ from benchmarks.still_world import StillWorld
 from jaxtrack import Params, StaticParams
 from jaxtrack.env import SearchTrack
 from jaxtrack.report import PACKAGES
+from train.learner import LOGGED
 
 pytestmark = pytest.mark.usefixtures("quick_compilation")
 
@@ -59,7 +60,7 @@ def test_the_still_world_shows_observations_like_the_environments():
     for name, values in row.observation.items():
         np.testing.assert_array_equal(shown[name], values)
         np.testing.assert_array_equal(after.observation[name], values)
-    assert set(info) == {"final_observation", *learner.learner.LOGGED}
+    assert set(info) == {"final_observation", *LOGGED}
 
 
 def test_ours_learns_from_all_samples_of_an_update():

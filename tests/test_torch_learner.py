@@ -4,7 +4,8 @@ import jax
 import numpy as np
 import pytest
 
-from benchmarks.learner import LearnerOptions, configure
+from benchmarks.learner import LearnerOptions
+from benchmarks.ppo import configure
 from benchmarks.still_world import random_observation
 from jaxtrack import StaticParams
 from train.networks import ENCODERS, PaperNetwork
@@ -96,13 +97,13 @@ def policy_state(params, encoder):
 def test_with_our_weights_it_gives_our_outputs(draw_weights, observations, encoder):
     import torch
 
-    from benchmarks.torch_learner import build_ppo
+    from benchmarks.torch_learner import build_ppo, still_env
 
     network = PaperNetwork(encoder=encoder, num_looks=LOOKS)
     variables = draw_weights(network, observations)
     logits, value = jax.jit(network.apply)(variables, observations)
 
-    policy = build_ppo(configure(encoder, OPTIONS), observations).policy
+    policy = build_ppo(configure(encoder, OPTIONS), still_env(observations, LOOKS)).policy
     params = jax.tree.map(np.asarray, variables["params"])
     ours = {name: torch.tensor(np.array(array)) for name, array in policy_state(params, encoder).items()}
     policy.load_state_dict(ours, strict=False)
@@ -121,9 +122,9 @@ def test_with_our_weights_it_gives_our_outputs(draw_weights, observations, encod
 
 @each_encoder
 def test_one_update_changes_the_weights(observations, encoder):
-    from benchmarks.torch_learner import build_ppo
+    from benchmarks.torch_learner import build_ppo, still_env
 
-    model = build_ppo(configure(encoder, OPTIONS), observations)
+    model = build_ppo(configure(encoder, OPTIONS), still_env(observations, LOOKS))
     before = {name: value.clone() for name, value in model.policy.named_parameters()}
     model.learn(OPTIONS.num_envs * OPTIONS.rollout_steps)
     assert model.num_timesteps == 64
