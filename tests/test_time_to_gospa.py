@@ -19,7 +19,7 @@ pytestmark = pytest.mark.usefixtures("quick_compilation")
 
 
 def test_without_a_warm_start_the_rate_is_the_advised_one():
-    assert time_to_gospa.configure("gain", 800_000, 0) == TrainConfig()
+    assert time_to_gospa.configure(TrainConfig.warm_start, TrainConfig.total_steps, 0) == TrainConfig()
     alone = time_to_gospa.configure("none", 2_000_000, 3)
     assert alone == TrainConfig(warm_start="none", total_steps=2_000_000, seed=3, learning_rate=3e-3)
 
@@ -59,7 +59,7 @@ def test_the_evaluation_is_that_of_train_evaluate():
     beams = build_agent("beams", static, params)
     weights = beams.network.init(jax.random.key(0), jax.vmap(beams.features)(observations))
     evaluate = time_to_gospa.compile_evaluation(config, env, weights)
-    competitor = agent("beams", [weights], (0,))
+    competitor = agent(config, [weights], (0,))
     expected = compare({"beams": competitor}, env, params, time_to_gospa.EPISODES, seed=3).played["beams"]
     assert evaluate(weights, 3) == pytest.approx(expected.values["gospa"].mean(), rel=1e-5)
     assert evaluate(weights, 4) != evaluate(weights, 3)

@@ -14,6 +14,7 @@ from benchmarks.ppo import Seconds
 from benchmarks.training import TrainingOptions, Turn
 from jaxtrack import StaticParams
 from jaxtrack.report import PACKAGES
+from train.config import TrainConfig
 
 pytestmark = pytest.mark.usefixtures("quick_compilation")
 
@@ -163,7 +164,7 @@ def test_command_writes_all_and_prints_markdown(tmp_path, monkeypatch, capsys):
     file = tmp_path / "result.json"
     arguments = ["--out", str(file), "--markdown", "--seed", "5", "--gospa", "120"]
     assert training.main(arguments) == 0
-    assert asked == [(120.0, "gain", 5)]
+    assert asked == [(120.0, TrainConfig.warm_start, 5)]
     result = json.loads(file.read_text())
     assert set(result) == {"date", "versions", "machine", "options", "scenario", "rows", "time_to_gospa"}
     assert {*PACKAGES, "flax", "optax"} <= set(result["versions"])
