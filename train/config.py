@@ -10,6 +10,7 @@ from jaxtrack.params import Params, StaticParams, validate
 from jaxtrack.policies import POLICIES
 from train.agents import AGENTS
 from train.networks import ENCODERS
+from train.ranges import Ranges, check_ranges
 from train.vision import SMALLEST_MAP
 
 NO_WARM_START = "none"
@@ -72,6 +73,15 @@ class TrainConfig:
     """Gradients are scaled down to this global norm."""
     reward_scale: float = 0.1
     """Factor on rewards in the learner, so that values are near 1; logged returns are unscaled."""
+
+    curriculum: Ranges = dataclasses.field(default_factory=dict)
+    """Numbers of the environment that move linearly, update by update, as in clutter_rate=0:0.2; a
+    table of pairs in a configuration file. `params` then count for the evaluation alone."""
+    curriculum_share: float = 0.5
+    """Share of the training after which the curriculum has arrived."""
+    randomise: Ranges = dataclasses.field(default_factory=dict)
+    """Numbers that every episode draws uniformly, as in detection_probability=0.8:1 initial_truths=2:10.
+    The agent is not told; `params` count for the evaluation, and for all that the agent computes."""
 
     static: StaticParams = dataclasses.field(
         default_factory=lambda: StaticParams(reward="shortfall", search_sharpness=16, observe_variances=True)
@@ -143,6 +153,9 @@ def check(config: TrainConfig) -> None:
     if config.static.continuous_actions:
         raise ValueError("static.continuous_actions = True: expected False, the agents choose discrete looks")
     validate(config.static, config.params)
+    _require(config, "curriculum_share", 0 < config.curriculum_share <= 1, "a number in (0, 1]")
+    tables = {"curriculum": config.curriculum, "randomise": config.randomise}
+    check_ranges(tables, config.static, config.params)
     out = Path(config.out)
     _require(config, "out", not config.out or not out.exists(), "a folder that does not exist yet")
 
@@ -208,13 +221,20 @@ def _replace(default: Any, values: dict[str, Any], prefix: str) -> Any:
         allowed = (*known[name], int) if float in known[name] else known[name]
         if not isinstance(value, allowed) or (isinstance(value, bool) and bool not in allowed):
             raise ValueError(f"{prefix}{name} = {value!r}: expected {known[name][0].__name__}")
-    # JSON and TOML have no tuples.
-    frozen = {name: tuple(value) if isinstance(value, list) else value for name, value in values.items()}
-    return dataclasses.replace(default, **frozen)
+    return dataclasses.replace(default, **{name: _frozen(value) for name, value in values.items()})
+
+
+def _frozen(value: Any) -> Any:
+    """Tuples for lists, also in a table: JSON and TOML have no tuples."""
+    if isinstance(value, dict):
+        return {name: _frozen(inner) for name, inner in value.items()}
+    return tuple(value) if isinstance(value, list) else value
 
 
 def _kinds(annotation: Any) -> tuple[type, ...]:
     """Types that a field takes."""
+    if annotation is Ranges:
+        return (dict,)
     if get_origin(annotation) is tuple:
         return list, tuple
     return get_args(annotation) or (annotation,)
