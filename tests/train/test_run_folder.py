@@ -237,6 +237,16 @@ def test_nothing_is_said_where_nothing_changed(train, stopped):
     assert "results may differ" not in train("--resume", stopped)[1]
 
 
+def test_a_run_from_before_an_option_existed_goes_on(train, whole, stopped):
+    path = stopped / "config.json"
+    values = json.loads(path.read_text())
+    del values["randomise"], values["params"]["track_weight"]
+    path.write_text(json.dumps(values))
+    code, _, said = train("--resume", stopped)
+    assert (code, said) == (0, "")
+    assert_same_result(stopped, whole)
+
+
 def test_two_trainings_in_one_folder(train, stopped):
     before = files(stopped)
     with MetricsFile(stopped):
