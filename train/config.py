@@ -3,12 +3,13 @@
 import dataclasses
 import math
 from pathlib import Path
-from typing import Any, get_args, get_origin
+from typing import Annotated, Any, get_args, get_origin
 
 from jaxtrack.cli import LARGEST_SEED
 from jaxtrack.params import Params, StaticParams, validate
 from jaxtrack.policies import POLICIES
 from train.agents import AGENTS
+from train.early_stop import Thresholds, check_thresholds
 from train.networks import ENCODERS
 from train.ranges import Ranges, check_ranges
 from train.vision import SMALLEST_MAP
@@ -73,6 +74,12 @@ class TrainConfig:
     """Gradients are scaled down to this global norm."""
     reward_scale: float = 0.1
     """Factor on rewards in the learner, so that values are near 1; logged returns are unscaled."""
+
+    stop_above: Thresholds = dataclasses.field(default_factory=dict)
+    """The training ends after the first update, the warm start aside, in which a column of metrics.csv
+    is above, as in completeness=0.9; it is evaluated as if it were at its end."""
+    stop_below: Thresholds = dataclasses.field(default_factory=dict)
+    """The same for a column that is below."""
 
     curriculum: Ranges = dataclasses.field(default_factory=dict)
     """Numbers of the environment that move linearly, update by update, as in clutter_rate=0:0.2; a
@@ -153,6 +160,8 @@ def check(config: TrainConfig) -> None:
     if config.static.continuous_actions:
         raise ValueError("static.continuous_actions = True: expected False, the agents choose discrete looks")
     validate(config.static, config.params)
+    for name in ("stop_above", "stop_below"):
+        check_thresholds(name, getattr(config, name), config.static.info_metrics)
     _require(config, "curriculum_share", 0 < config.curriculum_share <= 1, "a number in (0, 1]")
     tables = {"curriculum": config.curriculum, "randomise": config.randomise}
     check_ranges(tables, config.static, config.params)
@@ -233,7 +242,7 @@ def _frozen(value: Any) -> Any:
 
 def _kinds(annotation: Any) -> tuple[type, ...]:
     """Types that a field takes."""
-    if annotation is Ranges:
+    if get_origin(annotation) is Annotated:  # a table of numbers by name
         return (dict,)
     if get_origin(annotation) is tuple:
         return list, tuple

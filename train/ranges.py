@@ -4,13 +4,13 @@
 """
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Annotated, Any, get_args
 
 import numpy as np
-from tyro.constructors import PrimitiveConstructorSpec
 
 from jaxtrack.params import Params, StaticParams, validate
+from train.tables import read_number, table_option
 
 FIXED = ("field_limit", "beam_azimuth", "beam_elevation", "max_steps_in_episode", "trajectories")
 """Numbers that say what an action or an episode is; they stay as they are during a training."""
@@ -21,41 +21,18 @@ COUNTS = tuple(
 """Numbers that are whole."""
 
 
-def parse_ranges(words: Sequence[str]) -> dict[str, tuple[float, float]]:
-    """Ranges from words such as `clutter_rate=0:0.2`.
-
-    Raises:
-        ValueError: naming the word that is none.
-    """
-    ranges = {}
-    for word in words:
-        name, _, ends = word.partition("=")
-        try:
-            low, high = (_number(end) for end in ends.split(":"))
-        except ValueError:
-            raise ValueError(f"{word!r}: expected NAME=FROM:TO, such as clutter_rate=0:0.2") from None
-        ranges[name.replace("-", "_")] = (low, high)
-    return ranges
+def _read_ends(text: str) -> tuple[float, float]:
+    low, high = map(read_number, text.split(":"))
+    return low, high
 
 
-def _number(text: str) -> float:
-    try:
-        return int(text)
-    except ValueError:
-        return float(text)
-
-
-def _is_ranges(value: Any) -> bool:
-    return isinstance(value, dict)
-
-
-def _words(ranges: Mapping[str, tuple[float, float]]) -> list[str]:
-    return [f"{name}={low}:{high}" for name, (low, high) in ranges.items()]
+def _write_ends(ends: tuple[float, float]) -> str:
+    return f"{ends[0]}:{ends[1]}"
 
 
 Ranges = Annotated[
     dict[str, tuple[float, float]],
-    PrimitiveConstructorSpec("*", "NAME=FROM:TO", parse_ranges, _is_ranges, _words),
+    table_option("NAME=FROM:TO", "clutter_rate=0:0.2", _read_ends, _write_ends),
 ]
 """Names of numbers to their two ends; a table of pairs in TOML and JSON, words on the command line."""
 

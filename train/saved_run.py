@@ -130,7 +130,7 @@ def load_agent(folder: Path) -> tuple[TrainConfig, SearchTrack, Any]:
 
 def agree(folder: Path, values: dict[str, Any], checkpoint: Checkpoint) -> None:
     """Raises ValueError, naming the field, if config.json is not what a checkpoint was trained with."""
-    if found := first_difference(*map(with_new_fields, (values, checkpoint.config))):
+    if found := first_difference(with_new_fields(values), with_new_fields(checkpoint.config)):
         name, here, there = found
         raise ValueError(
             f"{folder / 'config.json'}: {name} = {here!r}, but the checkpoint was trained with {there!r}"

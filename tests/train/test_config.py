@@ -104,11 +104,14 @@ def test_the_scenario_is_checked_too():
     )
 
 
-def test_numbers_that_change_are_checked_too():
+def test_tables_are_checked_too():
     for table in ("curriculum", "randomise"):
         assert refusal(**{table: {"clutter_rate": (0, 9)}}) == (
             f"{table}.clutter_rate: clutter_rate = 9: expected at most max_clutter = 8 1/look"
         )
+    for table in ("stop_above", "stop_below"):
+        assert refusal(**{table: {"gospa": 9}}).startswith(f"{table}.gospa: expected one of reward, ")
+        check(TrainConfig(**SMALL, **{table: {"gospa": 9}}, static=StaticParams(info_metrics=("gospa",))))
     for share in (0.0, 1.1, NAN):
         assert refusal(curriculum_share=share) == f"curriculum_share = {share}: expected a number in (0, 1]"
 
@@ -130,7 +133,8 @@ def changed(config):
         if dataclasses.is_dataclass(value):
             fields[field.name] = changed(value)
         elif isinstance(value, dict):
-            fields[field.name] = {"clutter_rate": (0, 0.2), "initial_truths": (2, 9)}
+            is_threshold = field.name.startswith("stop_")
+            fields[field.name] = {"completeness": 0.9} if is_threshold else {"clutter_rate": (0, 0.2)}
         elif field.name in CHOICES:
             fields[field.name] = CHOICES[field.name]
         elif isinstance(value, tuple):

@@ -3,7 +3,7 @@
 import pytest
 
 from jaxtrack import Params, StaticParams
-from train.ranges import check_ranges, parse_ranges
+from train.ranges import check_ranges
 
 STATIC, PARAMS = StaticParams(), Params()
 
@@ -13,21 +13,6 @@ def refusal(table, **more):
     with pytest.raises(ValueError) as caught:  # noqa: PT011  # callers compare the whole message
         check_ranges({"randomise": table, **more}, STATIC, PARAMS)
     return str(caught.value)
-
-
-def test_words_become_ranges_and_whole_numbers_stay_whole():
-    ranges = parse_ranges(["clutter-rate=0:0.2", "initial_truths=2:10", "kappa=-3:-1e-3"])
-    assert ranges == {"clutter_rate": (0, 0.2), "initial_truths": (2, 10), "kappa": (-3, -0.001)}
-    assert all(isinstance(end, int) for end in ranges["initial_truths"])
-    assert parse_ranges([]) == {}
-
-
-@pytest.mark.parametrize(
-    "word", ["clutter_rate", "clutter_rate=", "clutter_rate=1", "clutter_rate=0:1:2", "a=b:c"]
-)
-def test_a_word_that_is_no_range_is_named(word):
-    with pytest.raises(ValueError, match=f"'{word}': expected NAME=FROM:TO, such as"):
-        parse_ranges([word])
 
 
 def test_ranges_within_the_limits_are_allowed_in_either_order():
