@@ -3,13 +3,15 @@
 import dataclasses
 import math
 from pathlib import Path
-from typing import Any, get_args, get_origin
+from typing import Annotated, Any, get_args, get_origin
 
 from jaxtrack.cli import LARGEST_SEED
 from jaxtrack.params import Params, StaticParams, validate
 from jaxtrack.policies import POLICIES
 from train.agents import AGENTS
+from train.early_stop import Thresholds, check_thresholds
 from train.networks import ENCODERS, HEADS
+from train.ranges import Ranges, check_ranges
 from train.vision import SMALLEST_MAP
 
 NO_WARM_START = "none"
@@ -75,6 +77,21 @@ class TrainConfig:
     """Gradients are scaled down to this global norm."""
     reward_scale: float = 0.1
     """Factor on rewards in the learner, so that values are near 1; logged returns are unscaled."""
+
+    stop_above: Thresholds = dataclasses.field(default_factory=dict)
+    """The training ends after the first update, the warm start aside, in which a column of metrics.csv
+    is above, as in completeness=0.9; it is evaluated as if it were at its end."""
+    stop_below: Thresholds = dataclasses.field(default_factory=dict)
+    """The same for a column that is below."""
+
+    curriculum: Ranges = dataclasses.field(default_factory=dict)
+    """Numbers of the environment that move linearly, update by update, as in clutter_rate=0:0.2; a
+    table of pairs in a configuration file. `params` then count for the evaluation alone."""
+    curriculum_share: float = 0.5
+    """Share of the training after which the curriculum has arrived."""
+    randomise: Ranges = dataclasses.field(default_factory=dict)
+    """Numbers that every episode draws uniformly, as in detection_probability=0.8:1 initial_truths=2:10.
+    The agent is not told; `params` count for the evaluation, and for all that the agent computes."""
 
     static: StaticParams = dataclasses.field(
         default_factory=lambda: StaticParams(reward="shortfall", search_sharpness=16, observe_variances=True)
@@ -149,6 +166,11 @@ def check(config: TrainConfig) -> None:
     if config.static.continuous_actions:
         raise ValueError("static.continuous_actions = True: expected False, the agents choose discrete looks")
     validate(config.static, config.params)
+    for name in ("stop_above", "stop_below"):
+        check_thresholds(name, getattr(config, name), config.static.info_metrics)
+    _require(config, "curriculum_share", 0 < config.curriculum_share <= 1, "a number in (0, 1]")
+    tables = {"curriculum": config.curriculum, "randomise": config.randomise}
+    check_ranges(tables, config.static, config.params)
     out = Path(config.out)
     _require(config, "out", not config.out or not out.exists(), "a folder that does not exist yet")
 
@@ -214,13 +236,20 @@ def _replace(default: Any, values: dict[str, Any], prefix: str) -> Any:
         allowed = (*known[name], int) if float in known[name] else known[name]
         if not isinstance(value, allowed) or (isinstance(value, bool) and bool not in allowed):
             raise ValueError(f"{prefix}{name} = {value!r}: expected {known[name][0].__name__}")
-    # JSON and TOML have no tuples.
-    frozen = {name: tuple(value) if isinstance(value, list) else value for name, value in values.items()}
-    return dataclasses.replace(default, **frozen)
+    return dataclasses.replace(default, **{name: _frozen(value) for name, value in values.items()})
+
+
+def _frozen(value: Any) -> Any:
+    """Tuples for lists, also in a table: JSON and TOML have no tuples."""
+    if isinstance(value, dict):
+        return {name: _frozen(inner) for name, inner in value.items()}
+    return tuple(value) if isinstance(value, list) else value
 
 
 def _kinds(annotation: Any) -> tuple[type, ...]:
     """Types that a field takes."""
+    if get_origin(annotation) is Annotated:  # a table of numbers by name
+        return (dict,)
     if get_origin(annotation) is tuple:
         return list, tuple
     return get_args(annotation) or (annotation,)

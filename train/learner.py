@@ -20,6 +20,7 @@ from train.config import TrainConfig
 from train.gae import advantages
 from train.loss import Sample, explained_variance
 from train.pieces import minibatch_gradient, shortest_first
+from train.varied import randomised, scenario_at
 
 Chooser = Callable[[jax.Array, EnvState, jax.Array], jax.Array]
 """Key, states of the environments, and logits to actions `[B, 2]`."""
@@ -37,7 +38,8 @@ class LearnerState(struct.PyTreeNode):
         inputs: network inputs of the current observations.
         episode_return: `[B]` reward summed since the episode began.
         episode_length: `[B]` steps since the episode began.
-        scenario: numbers of the environment; traced, so that changing them recompiles nothing.
+        scenario: numbers of the environment; traced, so that changing them recompiles nothing. What
+            a curriculum moves is as in the last update.
         key: random key data.
         update: `[]` updates done.
     """
@@ -87,6 +89,7 @@ def init_learner(key: jax.Array, scenario: Params, env: SearchTrack, config: Tra
     The environments start at different times of their episode, so that a rollout holds all
     phases of an episode and their ends do not fall on one step.
     """
+    env, scenario = randomised(env, config), scenario_at(0, scenario, config)
     agent = build_agent(config.encoder, env.static, scenario, config.head)
     key_env, key_net, key = jax.random.split(key, 3)
     keys = jax.random.split(key_env, config.num_envs)
@@ -112,6 +115,8 @@ def train_step(
     state: LearnerState, env: SearchTrack, config: TrainConfig
 ) -> tuple[LearnerState, dict[str, jax.Array]]:
     """One update: a rollout of every environment, advantages, and PPO's epochs over them."""
+    env = randomised(env, config)
+    state = state.replace(scenario=scenario_at(state.update, state.scenario, config))
     agent = build_agent(config.encoder, env.static, state.scenario, config.head)
     key, key_rollout, key_update = jax.random.split(jax.random.wrap_key_data(state.key), 3)
     state, rollout, rollout_metrics = collect(key_rollout, state, env, agent, config)
@@ -121,7 +126,8 @@ def train_step(
         weights=weights, optimiser=optimiser, key=jax.random.key_data(key), update=state.update + 1
     )
     explained = explained_variance(samples.value, samples.advantage)
-    return state, {**rollout_metrics, **losses, "explained_variance": explained}
+    moved = {name: getattr(state.scenario, name) for name in config.curriculum}
+    return state, {**rollout_metrics, **losses, "explained_variance": explained, **moved}
 
 
 def collect(

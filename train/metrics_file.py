@@ -21,6 +21,7 @@ class MetricsFile:
         lost: updates before the first row; 0 unless the file was removed and the training resumed.
         num_rows: whole rows.
         seconds: the last row's, of all parts of a resumed training together; 0 without a row.
+        last: the last row's cells by column; empty without a row.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -48,6 +49,7 @@ class MetricsFile:
         self._empty = not text
         self._digest = hashlib.sha256()
         self.lost, self.num_rows, self.seconds = 0, len(self._rows), 0.0
+        self.last: dict[str, str] = {}
 
     def __enter__(self) -> "MetricsFile":
         """The file itself."""
@@ -78,7 +80,7 @@ class MetricsFile:
                     f"{self.path}: rows up to update {update} are missing or damaged; "
                     "move the file away to continue without them"
                 )
-            self.seconds = float(kept[-1]["seconds"])
+            self.last, self.seconds = kept[-1], float(kept[-1]["seconds"])
         self._file.truncate(sum(self._ends[: len(kept) + 1]) if kept else 0)
         self._file.seek(0, os.SEEK_END)
         self.num_rows = len(kept)
@@ -126,6 +128,7 @@ class MetricsFile:
             raise
         self._columns = list(row)
         self.num_rows += 1
+        self.last = values
         self._add_to_digest(values)
 
     def sync(self) -> None:

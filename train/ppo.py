@@ -145,11 +145,16 @@ def train(
             run.metrics.write(row)
             progress.update(task, completed=row["env_steps"], note=note(row))
             say_now_and_then(update, row, config, console)
-            if interrupt.signal or update % config.checkpoint_every == 0 or update == config.num_updates:
+            passed = run.passed
+            last = interrupt.signal or passed or update == config.num_updates
+            if last or update % config.checkpoint_every == 0:
                 run.save(state)
                 saved = update
+            if passed:
+                console.print(f"ended after update {update}: {passed}")
             if interrupt.signal:
                 code = exit_code(interrupt.signal)
+            if last:
                 break
     if code:
         say_stopped(update, saved, run, code)

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from train.checkpoint import Checkpoint, save, written_with
 from train.config import TrainConfig, check, first_difference, to_dict
+from train.early_stop import passed
 from train.learner import LearnerState
 from train.metrics_file import MetricsFile
 from train.saved_run import read_config, read_run, write_config
@@ -44,12 +45,20 @@ class Run:
 
     @property
     def trained(self) -> bool:
-        """All updates are done."""
-        return self.done == self.config.num_updates
+        """All updates are done, or as many as it took to pass a threshold."""
+        return self.done == self.config.num_updates or bool(self.done and self.passed)
+
+    @property
+    def passed(self) -> str:
+        """The threshold that the last row of metrics.csv passes after the warm start, in words, if one."""
+        row, config = self.metrics.last, self.config
+        if not row or int(row["update"]) <= config.warm_start_updates:
+            return ""
+        return passed(row, config.stop_above, config.stop_below)
 
     @property
     def finished(self) -> bool:
-        """All updates are done, and what follows them too: results.json is its last file."""
+        """The training is done, and what follows them too: results.json is its last file."""
         evaluated = not self.evaluation_episodes or (self.folder / "results.json").exists()
         return self.trained and evaluated
 

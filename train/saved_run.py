@@ -130,8 +130,15 @@ def load_agent(folder: Path) -> tuple[TrainConfig, SearchTrack, Any]:
 
 def agree(folder: Path, values: dict[str, Any], checkpoint: Checkpoint) -> None:
     """Raises ValueError, naming the field, if config.json is not what a checkpoint was trained with."""
-    if found := first_difference(values, checkpoint.config):
+    if found := first_difference(with_new_fields(values), with_new_fields(checkpoint.config)):
         name, here, there = found
         raise ValueError(
             f"{folder / 'config.json'}: {name} = {here!r}, but the checkpoint was trained with {there!r}"
         )
+
+
+def with_new_fields(values: dict[str, Any]) -> dict[str, Any]:
+    """A configuration as it was written, and the defaults of fields that did not exist yet."""
+    defaults = json.loads(json.dumps(to_dict(TrainConfig())))
+    tables = {name: {**defaults[name], **values.get(name, {})} for name in ("static", "params")}
+    return {**defaults, **values, **tables}

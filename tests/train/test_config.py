@@ -111,6 +111,18 @@ def test_the_scenario_is_checked_too():
     )
 
 
+def test_tables_are_checked_too():
+    for table in ("curriculum", "randomise"):
+        assert refusal(**{table: {"clutter_rate": (0, 9)}}) == (
+            f"{table}.clutter_rate: clutter_rate = 9: expected at most max_clutter = 8 1/look"
+        )
+    for table in ("stop_above", "stop_below"):
+        assert refusal(**{table: {"gospa": 9}}).startswith(f"{table}.gospa: expected one of reward, ")
+        check(TrainConfig(**SMALL, **{table: {"gospa": 9}}, static=StaticParams(info_metrics=("gospa",))))
+    for share in (0.0, 1.1, NAN):
+        assert refusal(curriculum_share=share) == f"curriculum_share = {share}: expected a number in (0, 1]"
+
+
 def test_the_folder_of_a_run_is_new(tmp_path):
     assert refusal(out=str(tmp_path)) == f"out = {str(tmp_path)!r}: expected a folder that does not exist yet"
     check(TrainConfig(**SMALL, out=str(tmp_path / "new")))
@@ -127,6 +139,9 @@ def changed(config):
         value = getattr(config, field.name)
         if dataclasses.is_dataclass(value):
             fields[field.name] = changed(value)
+        elif isinstance(value, dict):
+            is_threshold = field.name.startswith("stop_")
+            fields[field.name] = {"completeness": 0.9} if is_threshold else {"clutter_rate": (0, 0.2)}
         elif field.name in CHOICES:
             fields[field.name] = CHOICES[field.name]
         elif isinstance(value, tuple):
@@ -164,6 +179,7 @@ def test_missing_fields_keep_their_defaults():
         ({"static": {"nonsense": 1}}, "static.nonsense: no such field; expected one of continuous_actions, "),
         ({"params": {"nonsense": 1}}, "params.nonsense: no such field; expected one of alpha, "),
         ({"num_envs": "8"}, "num_envs = '8': expected int"),
+        ({"randomise": [1, 2]}, "randomise = [1, 2]: expected dict"),
         ({"num_envs": 8.0}, "num_envs = 8.0: expected int"),
         ({"num_envs": True}, "num_envs = True: expected int"),
         ({"static": {"info_metrics": "gospa"}}, "static.info_metrics = 'gospa': expected list"),

@@ -15,6 +15,7 @@ from jaxtrack.policies import POLICIES
 from tests.train.small_run import OPTIONS, assert_same_result
 from train import evaluate, ppo
 from train.checkpoint import updates
+from train.early_stop import COLUMNS
 from train.episode_metrics import METRICS
 from train.figures import FIGURES
 from train.metrics_file import MetricsFile
@@ -75,6 +76,11 @@ def test_a_whole_run_leaves_all_its_files(whole):
     lines = (folder / "episodes.csv").read_text().splitlines()
     assert len(lines) == 1 + 2 * (1 + len(BASELINES))
     assert set(json.loads((folder / "config.json").read_text())["static"]) == set(vars(StaticParams()))
+
+
+def test_the_columns_that_can_end_a_training_are_those_of_the_metrics(whole):
+    counts = {"update", "env_steps", "seconds", "steps_per_second", "episodes"}
+    assert set(read_rows(whole[0])[0]) - counts == set(COLUMNS)
 
 
 @pytest.mark.slow

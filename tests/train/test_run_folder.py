@@ -237,6 +237,89 @@ def test_nothing_is_said_where_nothing_changed(train, stopped):
     assert "results may differ" not in train("--resume", stopped)[1]
 
 
+def test_a_run_from_before_an_option_existed_goes_on(train, whole, stopped):
+    path = stopped / "config.json"
+    values = json.loads(path.read_text())
+    del values["randomise"], values["params"]["track_weight"]
+    path.write_text(json.dumps(values))
+    code, _, said = train("--resume", stopped)
+    assert (code, said) == (0, "")
+    assert_same_result(stopped, whole)
+
+
+@pytest.fixture
+def start_with(train, tmp_path):
+    """Starts the made-up training with more options, without a warm start unless they tell."""
+    options = ("--config", tmp_path / "config.json", "--warm-start-steps", 0)
+    return lambda folder, *more, **named: train(*options, "--out", folder, *more, **named)
+
+
+def completeness(folder):
+    """That column of metrics.csv."""
+    columns, *rows = without_clock(folder)
+    return [float(row[columns.index("completeness")]) for row in rows]
+
+
+def threshold_after(folder, update):
+    """A completeness that the made-up training, whose metrics grow, passes in the update after this one."""
+    before, after = completeness(folder)[update - 1 : update + 1]
+    assert before < after
+    return (before + after) / 2
+
+
+def test_a_passed_threshold_ends_the_training_as_its_end_does(
+    train, whole, start_with, tmp_path, monkeypatch
+):
+    folder, called = tmp_path / "short", []
+    threshold = threshold_after(whole, 4)
+    code, said, _ = start_with(folder, "--stop-above", f"completeness={threshold}")
+    assert code == 0
+    assert f"ended after update 5: completeness = {completeness(whole)[4]:.8g} is above" in said
+    assert "stopped" not in said
+    assert without_clock(folder) == without_clock(whole)[: 1 + 5]
+    assert updates(folder) == [4, 5]
+    code, said, _ = train("--resume", folder)
+    assert "the training had finished, nothing is left to do" in said
+    assert updates(folder) == [4, 5]
+    monkeypatch.setattr(ppo, "finish", lambda state, env, run, console: called.append(int(state.update)))
+    assert train("--resume", folder, "--evaluation-episodes", 3)[0] == 0
+    assert called == [5]
+
+
+def test_killed_before_the_checkpoint_of_its_last_update_it_ends_there_again(
+    train, whole, start_with, tmp_path, monkeypatch
+):
+    folder, short = tmp_path / "killed", tmp_path / "short"
+    option = ("--stop-above", f"completeness={threshold_after(whole, 4)}")
+    assert start_with(short, *option)[0] == 0
+
+    def killed(*_):
+        raise SystemExit(9)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(run_folder.Run, "save", killed)
+        assert start_with(folder, *option)[0] == 9
+    assert len(completeness(folder)) == 2
+    with monkeypatch.context() as patch:
+        save = run_folder.Run.save
+        patch.setattr(run_folder.Run, "save", lambda *now: killed() if now[1].update == 5 else save(*now))
+        assert train("--resume", folder)[0] == 9
+    assert len(completeness(folder)) == 5
+    assert updates(folder) == [2, 4]
+    assert train("--resume", folder)[0] == 0
+    assert_same_result(folder, short)
+
+
+def test_thresholds_count_after_the_warm_start(whole, start_with, tmp_path):
+    threshold = threshold_after(whole, 4)
+    option = ("--stop-above", f"completeness={threshold}", "--warm-start-steps", 7 * CONFIG.batch_size)
+    assert start_with(tmp_path / "late", *option)[0] == 0
+    assert len(completeness(tmp_path / "late")) == 8
+    option = ("--stop-below", f"completeness={threshold}", "--warm-start-steps", 2 * CONFIG.batch_size)
+    assert start_with(tmp_path / "below", *option)[0] == 0
+    assert len(completeness(tmp_path / "below")) == 3
+
+
 def test_two_trainings_in_one_folder(train, stopped):
     before = files(stopped)
     with MetricsFile(stopped):
