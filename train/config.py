@@ -43,6 +43,9 @@ class TrainConfig:
     checkpoint_every: int = 20
     """Updates between checkpoints; one is always written at the end."""
 
+    pretrain_steps: int = 0
+    """Environment steps with random looks on which one of the paper's encoders learns to reproduce track
+    lists, as an auto-encoder, before anything else."""
     warm_start: str = "sweep"
     """Rule that the policy imitates at first, a baseline by name; none: it learns from rewards alone."""
     warm_start_steps: int = 150_000
@@ -149,8 +152,10 @@ def check(config: TrainConfig) -> None:
     _require(config, "warm_start", config.warm_start in teachers, f"one of {', '.join(teachers)}")
     in_range = 0 <= config.seed <= LARGEST_SEED
     _require(config, "seed", in_range, f"an integer in [0, {LARGEST_SEED}]")
-    for name in ("evaluation_episodes", "warm_start_steps", "microbatch"):
+    for name in ("evaluation_episodes", "warm_start_steps", "pretrain_steps", "microbatch"):
         _require(config, name, getattr(config, name) >= 0, "an integer >= 0")
+    if config.encoder not in ENCODERS:
+        _require(config, "pretrain_steps", config.pretrain_steps == 0, f"0, {config.encoder} has no encoder")
     _require(config, "checkpoint_every", config.checkpoint_every >= 1, "an integer >= 1")
     for name in _SHARES:
         _require(config, name, 0 <= getattr(config, name) <= 1, "a number in [0, 1]")

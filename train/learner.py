@@ -20,6 +20,7 @@ from train.config import TrainConfig
 from train.gae import advantages
 from train.loss import Sample, explained_variance
 from train.pieces import minibatch_gradient, shortest_first
+from train.pretrain import pretrain
 from train.varied import randomised, scenario_at
 
 Chooser = Callable[[jax.Array, EnvState, jax.Array], jax.Array]
@@ -98,6 +99,9 @@ def init_learner(key: jax.Array, scenario: Params, env: SearchTrack, config: Tra
     # The first observations are constants: unhidden, the compiler would spend seconds on folding them.
     inputs = jax.vmap(agent.features)(jax.lax.optimization_barrier(observation))
     weights = agent.network.init(key_net, inputs)
+    if config.pretrain_steps:
+        key, key_lists = jax.random.split(key)
+        weights, _ = pretrain(key_lists, weights, observation, state, scenario, env, config)
     return LearnerState(
         weights=weights,
         optimiser=make_optimiser(config).init(weights),

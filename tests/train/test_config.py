@@ -47,7 +47,7 @@ def test_seeds_have_32_bits(seed):
     assert refusal(seed=seed) == f"seed = {seed}: expected an integer in [0, 4294967295]"
 
 
-@pytest.mark.parametrize("name", ["warm_start_steps", "evaluation_episodes", "microbatch"])
+@pytest.mark.parametrize("name", ["warm_start_steps", "evaluation_episodes", "microbatch", "pretrain_steps"])
 def test_counts_that_may_be_zero_are_not_negative(name):
     assert refusal(**{name: -1}) == f"{name} = -1: expected an integer >= 0"
     check(TrainConfig(**{**SMALL, name: 0}))
