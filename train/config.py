@@ -62,7 +62,7 @@ class TrainConfig:
     microbatch: int = 0
     """Samples per piece of a gradient, for the cache; changes nothing but speed and rounding. 0: at
     most 128 for beams, 32 for the paper's encoders."""
-    learning_rate: float = 3e-4
+    learning_rate: float = 3e-5
     """Adam's step size when learning from rewards starts. Without a warm start, 3e-3 learns faster."""
     anneal: bool = True
     """Let the learning rate fall to zero from there, linearly."""
