@@ -1,6 +1,7 @@
 """A trained run as two small files, to keep or to share.
 
-`python -m train.export --run runs/beams-seed0 --out agents/beams` writes configuration and weights: 50 kB.
+`python -m train.export --run runs/beams-seed0 --out agents/beams` writes configuration and weights: 50 kB,
+1 MB with NatureCNN.
 """
 
 import dataclasses
