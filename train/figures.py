@@ -37,6 +37,8 @@ DARK = 0.6
 """Share of the largest value above which a cell is so dark that its text is white."""
 LABEL_GAP = 0.07
 """Least distance between direct labels, as a share of the height."""
+LARGEST_MOVE = 2.5
+"""Gaps by which a direct label may be moved up from the end of its curve."""
 
 FIGURES = {
     "comparison": "Mean of every policy and its 95 % interval.",
@@ -113,12 +115,18 @@ def line_style(number: int, trained: bool) -> dict[str, Any]:
 
 
 def label_ends(axes: "Axes", ends: Mapping[str, float]) -> None:
-    """Writes every policy's name to the right of its curve's end, moved apart where they would touch."""
+    """Writes policies' names to the right of their curves' ends, moved apart where they would touch.
+
+    A name that would come to stand far from its curve is left to the legend.
+    """
     low, high = axes.get_ylim()
     height = (high - low) * LABEL_GAP
     place = low - height
     for policy, value in sorted(ends.items(), key=lambda entry: entry[1]):
-        place = max(value, place + height)
+        beside = max(value, place + height)
+        if beside > value + LARGEST_MOVE * height:
+            continue
+        place = beside
         at = (1.015, (place - low) / (high - low))
         axes.annotate(policy, at, xycoords="axes fraction", fontsize=7.5, va="center", annotation_clip=False)
 

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from matplotlib import pyplot as plt
 from matplotlib.figure import Figure
 from PIL import Image
 
@@ -51,6 +52,16 @@ def test_curves_have_a_band_a_unit_and_a_name_at_their_end(tmp_path, saved):
     labels = {text.get_text(): text.xy[1] for text in axes.texts}
     assert sorted(labels, key=labels.get) == ["static", "own", "random"]
     assert np.diff(sorted(labels.values())).min() > figures.LABEL_GAP - 1e-9
+
+
+def test_a_name_far_from_its_curve_is_left_to_the_legend(saved):
+    _, axes = plt.subplots()
+    axes.set_ylim(0, 1)
+    ends = {f"low {number}": 0.0 for number in range(9)} | {"high": 0.9}
+    figures.label_ends(axes, ends)
+    labels = {text.get_text(): text.xy[1] for text in axes.texts}
+    assert list(labels) == ["low 0", "low 1", "low 2", "high"]
+    np.testing.assert_allclose(list(labels.values()), [0, 0.07, 0.14, 0.9])
 
 
 def test_eight_policies_differ_without_colour():
