@@ -40,7 +40,7 @@ def compile_evaluation(config: TrainConfig, env: SearchTrack, weights: Any) -> C
     params = config.params
 
     def mean_gospa(weights: Any, keys: jax.Array) -> jax.Array:
-        act = agent_policy(config.encoder, weights)(env.static, params)
+        act = agent_policy(config.encoder, weights, head=config.head)(env.static, params)
         return play_episodes(keys, act, env, params, int(params.max_steps_in_episode))[0]["gospa"].mean()
 
     def keys(seed: int) -> jax.Array:

@@ -78,7 +78,7 @@ def test_both_networks_have_the_same_number_of_parameters(encoder):
     from benchmarks.stone_soup_ppo import StoneSoupPPO
 
     config = configure(encoder, OPTIONS)
-    network = build_agent(encoder, config.static, config.params).network
+    network = build_agent(encoder, config.static, config.params, config.head).network
     env, _ = make(config.params, config.static)
     observation = jax.eval_shape(env.reset_env, jax.random.key(0), config.params)[0]
     one = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct((1, *leaf.shape), leaf.dtype), observation)

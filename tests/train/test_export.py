@@ -88,7 +88,9 @@ def test_shipped_agents_are_better_than_the_tuned_index_rule(folder):
     config, env, weights = load_run(folder)
     played = compare(
         {
-            "agent": Competitor(lambda own: agent_policy(config.encoder, own), [weights], (config.seed,)),
+            "agent": Competitor(
+                lambda own: agent_policy(config.encoder, own, head=config.head), [weights], (config.seed,)
+            ),
             "rule": rule(POLICIES["index_tuned"]),
         },
         env,
