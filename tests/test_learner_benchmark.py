@@ -1,9 +1,6 @@
 """The benchmark of the learner: an environment that costs nothing, honest rows, clear refusals."""
 
 import json
-import subprocess
-import sys
-from pathlib import Path
 from types import SimpleNamespace
 
 import jax
@@ -17,27 +14,10 @@ from benchmarks.still_world import StillWorld
 from jaxtrack import Params, StaticParams
 from jaxtrack.env import SearchTrack
 from jaxtrack.report import PACKAGES
+from tests.missing_module import run_without
 from train.learner import LOGGED
 
 pytestmark = pytest.mark.usefixtures("quick_compilation")
-
-ROOT = Path(__file__).parents[1]
-
-WITHOUT = """
-import sys
-
-class Absent:
-    def find_spec(self, name, path=None, target=None):
-        if name == {missing!r}:
-            raise ModuleNotFoundError(f"No module named {{name!r}}", name=name)
-
-sys.meta_path.insert(0, Absent())
-sys.argv = ["benchmarks.learner"]
-from jaxtrack.cli import run
-from benchmarks.learner import main
-run(main)
-"""
-"""The command in a Python in which a module can not be found."""
 
 
 def test_the_still_world_shows_observations_like_the_environments():
@@ -141,8 +121,7 @@ def test_wrong_options_end_before_anything_is_measured(arguments, message, monke
 
 @pytest.mark.parametrize("missing", ["torch", "stable_baselines3"])
 def test_without_the_extra_the_command_says_in_one_line_what_to_install(missing):
-    code = WITHOUT.format(missing=missing)
-    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False)
+    done = run_without(missing, "benchmarks.learner")
     assert done.returncode == 2
     (line,) = done.stderr.splitlines()
     assert line.startswith("error: ")

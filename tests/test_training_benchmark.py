@@ -2,9 +2,6 @@
 
 import dataclasses
 import json
-import subprocess
-import sys
-from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -14,11 +11,11 @@ from benchmarks.ppo import Seconds
 from benchmarks.training import TrainingOptions, Turn
 from jaxtrack import StaticParams
 from jaxtrack.report import PACKAGES
+from tests.missing_module import run_without
 from train.config import TrainConfig
 
 pytestmark = pytest.mark.usefixtures("quick_compilation")
 
-ROOT = Path(__file__).parents[1]
 SMALL = TrainingOptions(
     encoders=("flatten",),
     num_envs=8,
@@ -37,22 +34,6 @@ TURNS = [
 ]
 """Whole updates of theirs take 8, 25 and 2 s."""
 SILENT = SimpleNamespace(add_task=lambda *_, **__: 0, advance=lambda _: 0, update=lambda *_, **__: 0)
-
-WITHOUT = """
-import sys
-
-class Absent:
-    def find_spec(self, name, path=None, target=None):
-        if name == {missing!r}:
-            raise ModuleNotFoundError(f"No module named {{name!r}}", name=name)
-
-sys.meta_path.insert(0, Absent())
-sys.argv = ["benchmarks.training"]
-from jaxtrack.cli import run
-from benchmarks.training import main
-run(main)
-"""
-"""The command in a Python in which a module can not be found."""
 
 
 def a_row(turns=TURNS, encoder="flatten"):
@@ -213,8 +194,7 @@ def test_wrong_options_end_before_anything_is_measured(arguments, message, monke
 
 @pytest.mark.parametrize("missing", ["torch", "stable_baselines3"])
 def test_without_the_extra_the_command_says_in_one_line_what_to_install(missing):
-    code = WITHOUT.format(missing=missing)
-    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False)
+    done = run_without(missing, "benchmarks.training")
     assert done.returncode == 2
     (line,) = done.stderr.splitlines()
     assert line.startswith("error: ")

@@ -92,17 +92,17 @@ def build_agent(name: str, static: StaticParams, params: Params, head: str = "be
     """
     if name not in AGENTS:
         raise ValueError(f"encoder = {name!r}: expected one of {', '.join(AGENTS)}")
-    beams = BeamGeometry(static, params)
     if name == "beams":
-        return Agent(beams, BeamNetwork(), JOINT)
+        return Agent(BeamGeometry(static, params), BeamNetwork(), JOINT)
     network = PaperNetwork(encoder=name, head=head, num_looks=static.num_looks)
     distribution = FACTORED if head == "factored" else JOINT
     lists = TrackLists(static.max_tracks, used_slots, cut_lists) if name in ANY_LENGTH else None
-
-    def features(observation: Observation) -> Any:
-        return {**observation, "beams": beams(observation)} if head == "beams" else observation
-
-    return Agent(features, network, distribution, lists)
+    if head != "beams":
+        return Agent(lambda observation: observation, network, distribution, lists)
+    beams = BeamGeometry(static, params)
+    return Agent(
+        lambda observation: {**observation, "beams": beams(observation)}, network, distribution, lists
+    )
 
 
 def used_slots(observations: dict[str, Any]) -> jax.Array:

@@ -144,8 +144,6 @@ def check(config: TrainConfig) -> None:
     if config.encoder not in AGENTS:
         raise ValueError(f"encoder = {config.encoder!r}: expected one of {', '.join(AGENTS)}")
     _require(config, "head", config.head in HEADS, f"one of {', '.join(HEADS)}")
-    if config.encoder not in ENCODERS:
-        _require(config, "head", config.head == "beams", f"beams, the head of {config.encoder}")
     for name in _AT_LEAST_ONE:
         _require(config, name, getattr(config, name) >= 1, "an integer >= 1")
     teachers = (NO_WARM_START, *POLICIES)
@@ -155,6 +153,7 @@ def check(config: TrainConfig) -> None:
     for name in ("evaluation_episodes", "warm_start_steps", "pretrain_steps", "microbatch"):
         _require(config, name, getattr(config, name) >= 0, "an integer >= 0")
     if config.encoder not in ENCODERS:
+        _require(config, "head", config.head == "beams", f"beams, the head of {config.encoder}")
         _require(config, "pretrain_steps", config.pretrain_steps == 0, f"0, {config.encoder} has no encoder")
     _require(config, "checkpoint_every", config.checkpoint_every >= 1, "an integer >= 1")
     for name in _SHARES:

@@ -151,9 +151,9 @@ def group_runs(runs: Sequence[tuple[Path, TrainConfig, Any]], greedy: bool) -> d
             members.append(one)
     encoders = [members[0][1].encoder for _, members in groups]
     competitors = {}
-    for encoder, (_, members) in zip(encoders, groups, strict=True):
-        config = members[0][1]
-        name = encoder if encoders.count(encoder) == 1 else f"{encoder} ({members[0][0].name})"
+    for _, members in groups:
+        folder, config, _ = members[0]
+        name = config.encoder if encoders.count(config.encoder) == 1 else f"{config.encoder} ({folder.name})"
         seeds = tuple(config.seed for _, config, _ in members)
         competitors[name] = agent(config, [weights for _, _, weights in members], seeds, greedy)
     return competitors

@@ -20,6 +20,7 @@ from train.config import TrainConfig
 from train.encoders import zero_padding
 from train.networks import ENCODERS
 from train.orthogonal import orthogonal
+from train.vision import GAIN
 
 LEARNING_RATE = 1e-3
 WIDTH = 128
@@ -35,7 +36,7 @@ class Decoder(nn.Module):
     @nn.compact
     def __call__(self, latent: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Maps latents `[B, Z]` to tracks `[B, T, F]` and to logits `[B, T]` that a slot holds one."""
-        hidden = nn.relu(nn.Dense(WIDTH, kernel_init=orthogonal(2**0.5))(latent))
+        hidden = nn.relu(nn.Dense(WIDTH, kernel_init=orthogonal(GAIN))(latent))
         rows = nn.Dense(self.slots * (self.features + 1), kernel_init=orthogonal(1.0))(hidden)
         rows = rows.reshape(-1, self.slots, self.features + 1)
         return rows[..., 1:], rows[..., 0]
