@@ -16,13 +16,14 @@ from typing import TYPE_CHECKING
 import jax
 import jax.numpy as jnp
 
+from jaxtrack.kernel import one_by_one
 from jaxtrack.models import elevation_bearing_range
 from jaxtrack.observation import variances
 from jaxtrack.params import Params, StaticParams
 from jaxtrack.sampling import draw_index, first_largest
 from jaxtrack.scan_map import beam_means, beam_sizes, look_grid
 from jaxtrack.search_plan import search_plan
-from jaxtrack.sensor import in_beams, look_number
+from jaxtrack.sensor import frames, in_beams_of, look_number
 from jaxtrack.types import Tracks, position
 
 if TYPE_CHECKING:
@@ -243,5 +244,18 @@ def removed_variance(of_position: jax.Array, distance: jax.Array, params: Params
 
 def sum_in_beams(values: jax.Array, tracks: Tracks, looks: jax.Array, params: Params) -> jax.Array:
     """Sum `[A]` of the values `[T]` of the live tracks in the beam of each of `looks` `[A, 2]`."""
-    inside = in_beams(position(tracks.mean), looks, params)
-    return jnp.sum(jnp.where(inside & tracks.active[:, None], values[:, None], 0.0), axis=0)
+    return one_by_one(_sum_over_tracks)(values, position(tracks.mean), tracks.active, frames(looks), params)
+
+
+def _sum_over_tracks(
+    values: jax.Array, points: jax.Array, active: jax.Array, of_looks: tuple[jax.Array, ...], params: Params
+) -> jax.Array:
+    """Track by track: an empty slot costs a CPU nothing."""
+
+    def add(track: jax.Array, total: jax.Array) -> jax.Array:
+        return total + jnp.where(in_beams_of(points[track], of_looks, params), values[track], 0.0)
+
+    def add_if_alive(track: jax.Array, total: jax.Array) -> jax.Array:
+        return jax.lax.cond(active[track], add, lambda track, total: total, track, total)
+
+    return jax.lax.fori_loop(0, active.size, add_if_alive, jnp.zeros_like(of_looks[0], values.dtype))

@@ -129,10 +129,18 @@ def _ahead(turned: jax.Array, params: Params) -> jax.Array:
 
 def in_beams(points: jax.Array, looks: jax.Array, params: Params) -> jax.Array:
     """`[T, A]` whether points `[T, 3]` lie in the beams of looks `[A, 2]`."""
-    # The looks come last: a CPU works on several numbers at a time only along long rows. And what is known
-    # of a look is worked out once, not again for every point.
-    of_looks = stage(_cosines_and_sines)(looks.T)
-    return _ahead(_turn(points[:, None], of_looks), params)
+    # The looks come last: a CPU works on several numbers at a time only along long rows.
+    return in_beams_of(points[:, None], frames(looks), params)
+
+
+def frames(looks: jax.Array) -> tuple[jax.Array, ...]:
+    """What is known of looks `[A, 2]` whatever the point: worked out once, not again for every point."""
+    return stage(_cosines_and_sines)(looks.T)
+
+
+def in_beams_of(points: jax.Array, of_looks: tuple[jax.Array, ...], params: Params) -> jax.Array:
+    """`[..., A]` whether points `[..., 3]`, or `[..., 1, 3]`, lie in the beams of A looks, given `frames`."""
+    return _ahead(_turn(points, of_looks), params)
 
 
 def detect(

@@ -18,7 +18,7 @@ from jaxtrack.kernel import add_up, one_by_one
 from jaxtrack.metrics import begins, pairwise_distances
 from jaxtrack.params import Params
 from jaxtrack.track_to_truth import Stretch, associate_tracks_to_truths
-from jaxtrack.types import Tracks, Truths, position, velocity
+from jaxtrack.types import NO_TRUTH, Tracks, Truths, position, velocity
 
 LARGEST_IN_ONE_KERNEL = 1000
 """Pairs of truth and track slot. Records with more are gone through together: sums over so many are
@@ -151,7 +151,8 @@ def _look_back(
     def one_step(carry: tuple[_Behind, jax.Array], now: Any) -> tuple[tuple[_Behind, jax.Array], _Found]:
         behind, longest = carry
         truths, tracks, begins, closed, duration, step = now
-        behind = _take_up(behind, closed)
+        closes = jnp.any(closed.truth != NO_TRUTH)
+        behind = jax.lax.cond(closes, _take_up, lambda behind, closed: behind, behind, closed)
         together = (behind.start <= step) & (step <= behind.end)
         going_on = together & (step < behind.end)
         spent = behind.spent + jnp.where(going_on, duration, 0.0)

@@ -69,7 +69,7 @@ class StepRow(struct.PyTreeNode):
     Attributes:
         values: scalars by name.
         truths: the truths after the step.
-        tracks: the tracks after the step, without their covariances.
+        tracks: the tracks after the step, as much as SIAP needs of them.
         tracked: `[N]` which truths have a track within the GOSPA cut-off.
         look: number of the look nearest to where the radar looked.
     """
@@ -102,7 +102,7 @@ def step_row(
     return StepRow(
         values=values,
         truths=truths,
-        tracks=tracks.replace(covariance=None),
+        tracks=tracks.replace(covariance=None, updated_by=None, age=None),
         tracked=jnp.any(distances < params.gospa_cutoff, axis=-1),
         look=look_number(record.look, env.static, params),
     )

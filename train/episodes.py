@@ -18,6 +18,7 @@ from jaxtrack.episode import EnvState
 from jaxtrack.params import Params
 from jaxtrack.policies import Policy, PolicyBuilder
 from train.episode_metrics import CURVES, METRICS, StepRow, episode_curves, episode_values, step_row
+from train.prepared import Kept, Prepared, prepare
 
 MEMORY = 105e6
 """Bytes that the record of a chunk may take. The same on every machine, because rounding differs with
@@ -131,13 +132,19 @@ def compare(
     length = int(params.max_steps_in_episode)
     chunks = list(split(jax.random.split(jax.random.key(seed), episodes), env, length))
     started = time.perf_counter()
-    program = compile_program(competitors, env, params, length, chunks[0][0])
+    prepared = [prepare(one.build, one.weights[0], env, params) for one in competitors.values()]
+    kept = [
+        [one.work_out(weights, params) for weights in competitor.weights]
+        for one, competitor in zip(prepared, competitors.values(), strict=True)
+    ]
+    firsts = [own[0] for own in kept]
+    program = compile_program(prepared, firsts, env, params, length, chunks[0][0])
     compiled = time.perf_counter()
-    rounds = [(which, weights) for which, one in enumerate(competitors.values()) for weights in one.weights]
+    rounds = [(which, own) for which, seeds in enumerate(kept) for own in seeds]
 
-    def play(task: tuple[tuple[int, Any], tuple[jax.Array, int]]) -> Any:
-        (which, weights), (keys, number) = task
-        everyones = [weights if i == which else one.weights[0] for i, one in enumerate(competitors.values())]
+    def play(task: tuple[tuple[int, Kept], tuple[jax.Array, int]]) -> Any:
+        (which, own), (keys, number) = task
+        everyones = [own if i == which else first for i, first in enumerate(firsts)]
         chunk = jax.device_get(program(keys, jnp.asarray(which), everyones, params))
         return which, number, jax.tree.map(lambda leaf: leaf[:number], chunk)
 
@@ -164,21 +171,23 @@ def workers() -> int:
 
 
 def compile_program(
-    competitors: Mapping[str, Competitor], env: SearchTrack, params: Params, length: int, keys: jax.Array
+    prepared: Sequence[Prepared],
+    everyones: list[Kept],
+    env: SearchTrack,
+    params: Params,
+    length: int,
+    keys: jax.Array,
 ) -> Any:
-    """The compiled program: keys, number of the competitor, everyone's weights, params to a chunk."""
+    """The compiled program: keys, number of the competitor, what everyone keeps, params to a chunk."""
 
-    def play(keys: jax.Array, which: jax.Array, weights: list[Any], params: Params) -> Any:
-        policies = [
-            one.build(own)(env.static, params) for one, own in zip(competitors.values(), weights, strict=True)
-        ]
+    def play(keys: jax.Array, which: jax.Array, everyones: list[Kept], params: Params) -> Any:
+        policies = [one.policy(own) for one, own in zip(prepared, everyones, strict=True)]
 
         def act(key: jax.Array, state: EnvState) -> jax.Array:
             return jax.lax.switch(which, policies, key, state)
 
         return play_episodes(keys, act, env, params, length)
 
-    everyones = [one.weights[0] for one in competitors.values()]
     return jax.jit(play).lower(keys, jnp.asarray(0), everyones, params).compile()
 
 
