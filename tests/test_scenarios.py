@@ -20,16 +20,21 @@ pytestmark = pytest.mark.usefixtures("quick_compilation")
 STEPS = 3
 NOT_TRAINED = ("continuous",)
 """The agents choose discrete looks."""
-QUICK = ("accelerating",)
-"""With these the quick tests train and evaluate; the others differ in what is rendered too."""
+QUICK, QUICKLY_DRAWN = ("accelerating",), ("turning", "swarm", "flying", "continuous")
+"""Those that the quick tests play; the others run with -m slow."""
 OF_SCENARIOS = ("num-truths", "max-tracks", "max-detections", "max-clutter")
 SMALL = {name: value for name, value in OPTIONS.items() if name.removeprefix("static.") not in OF_SCENARIOS}
 WORDS = [word for option, value in SMALL.items() for word in (f"--{option}", str(value))]
 LEARN = ["--total-steps", "64", "--warm-start-steps", "32", "--evaluation-episodes", "0"]
 
 
-def each(names):
-    return [pytest.param(name, marks=() if name in QUICK else pytest.mark.slow) for name in names]
+def each(names, quick=QUICK):
+    return [pytest.param(name, marks=() if name in quick else pytest.mark.slow) for name in names]
+
+
+def assert_has_fields(name, static, params):
+    made = vars(static) | vars(params)
+    assert {field: made[field] for field in SCENARIOS[name]} == SCENARIOS[name]
 
 
 @pytest.fixture
@@ -48,30 +53,44 @@ def test_each_trains(name, tmp_path):
     run = tmp_path / "run"
     assert ppo.main(["--scenario", name, *WORDS, *LEARN, "--out", str(run)]) == 0
     config, _ = read_config(run)
-    saved = vars(config.static) | vars(config.params)
-    assert {field: saved[field] for field in SCENARIOS[name]} == SCENARIOS[name]
+    assert_has_fields(name, config.static, config.params)
     assert len((run / "metrics.csv").read_text().splitlines()) == 3  # what is not finite ends it before
 
 
 @pytest.mark.parametrize("name", each(SCENARIOS))
-def test_each_evaluates(name, short, capsys):
+def test_each_evaluates(name, short, monkeypatch, capsys):
+    played, play = [], evaluate.play
+
+    def spy(competitors, env, params, *rest):
+        played.append((env.static, params))
+        return play(competitors, env, params, *rest)
+
+    monkeypatch.setattr(evaluate, "play", spy)
     policies = ["--policies", "random", "index_tuned", "sweep"]
     assert evaluate.main([*policies, "--episodes", "2", "--scenario", name]) == 0
     assert "2 scenarios" in capsys.readouterr().out
+    assert_has_fields(name, *played[0])
 
 
-@pytest.mark.parametrize("name", SCENARIOS)
-def test_each_renders(name, short, tmp_path):
+@pytest.mark.parametrize("name", each(SCENARIOS, QUICKLY_DRAWN))
+def test_each_renders(name, short, monkeypatch, tmp_path):
+    drawn, save_frame = [], render.save_frame
+
+    def spy(episode, path):
+        drawn.append(episode)
+        save_frame(episode, path)
+
+    monkeypatch.setattr(render, "save_frame", spy)
     out = tmp_path / "last.png"
     assert render.main(["--scenario", name, "--steps", str(STEPS), "--out", str(out)]) == 0
     assert out.stat().st_size > 10_000
+    assert_has_fields(name, drawn[0].static, drawn[0].params)
 
 
 @pytest.mark.parametrize("name", SCENARIOS)
 def test_each_is_made_of_its_fields(name):
     env, params = jaxtrack.make(**read_scenario(name))
-    made = vars(env.static) | vars(params)
-    assert {field: made[field] for field in SCENARIOS[name]} == SCENARIOS[name]
+    assert_has_fields(name, env.static, params)
 
 
 @pytest.mark.parametrize("options", [evaluate.EvaluateOptions, ppo.Options])
