@@ -140,13 +140,16 @@ def test_fields_of_a_file_may_stand_in_tables_or_alone(tmp_path):
         read_scenario(str(tmp_path / "wrong.json"))
 
 
-def test_the_aircraft_of_a_recording_are_the_truths(tmp_path):
+def test_the_aircraft_of_a_recording_are_the_truths(short, tmp_path):
     recorded = write_states(tmp_path / "states.csv", state_rows(12))
     env, params = jaxtrack.make(**read_scenario(str(recorded)))
     assert 1 <= env.static.num_truths <= 4
     key = jax.random.key(0)
     episode = record_episode(env, params, lambda key, state: np.array([9, 9]), key, num_steps=2)
     np.testing.assert_allclose(episode.states.truths.state, params.trajectories[1:3], rtol=1e-5)
+    out = tmp_path / "aircraft.png"
+    assert render.main(["--scenario", str(recorded), "--steps", "2", "--out", str(out)]) == 0
+    assert out.stat().st_size > 10_000
 
 
 @pytest.mark.parametrize("name", ["moon", "paper.txt", ""])
