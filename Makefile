@@ -7,7 +7,7 @@ ARGS ?=
 
 export JAX_PLATFORMS ?= cpu
 
-.PHONY: help setup train test slow sb3 peers parity lint bench clean
+.PHONY: help setup train test slow sb3 peers parity lint bench docs clean
 
 help:
 	@echo "make train   train an agent, compare it with the baselines, draw pictures (runs/)"
@@ -18,6 +18,7 @@ help:
 	@echo "make parity  the parity table of the README, in full"
 	@echo "make lint    ruff and mypy only"
 	@echo "make bench   speeds beside Stone Soup's and FilterPy's in ten minutes (bench/)"
+	@echo "make docs    the site of the documentation (build/docs)"
 	@echo "make setup   .venv with everything the above need"
 	@echo "ARGS=... is handed on, for example: make train ARGS='--encoder mhsa --seed 1'"
 
@@ -60,6 +61,11 @@ bench: setup
 	$(BIN)/pip install --quiet --editable ".[bench]"
 	@started=$$(date +%s); $(BIN)/python -m benchmarks $(ARGS) && \
 	echo "make bench took $$(( $$(date +%s) - started )) s"
+
+docs: setup
+	$(BIN)/pip install --quiet --editable ".[docs]"
+	$(BIN)/sphinx-build --quiet --fail-on-warning --fresh-env -c docs . build/docs
+	@echo "build/docs/docs/index.html"
 
 clean:
 	rm -rf $(VENV) build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis

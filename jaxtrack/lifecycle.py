@@ -15,6 +15,7 @@ from jaxtrack.models import (
     measurement_sigmas,
 )
 from jaxtrack.params import Params
+from jaxtrack.platform import platform_velocity
 from jaxtrack.sampling import matches
 from jaxtrack.types import NO_DETECTION, Detections, Tracks, where_rows
 
@@ -70,7 +71,7 @@ def initial_estimate(detection: jax.Array, params: Params) -> tuple[jax.Array, j
     """States `[..., 6]` and covariances `[..., 6, 6]` of tracks from one detection `[..., 3]` each.
 
     The position is the inverse measurement with covariance ``G R G^T``, G the exact Jacobian
-    of the inverse; the velocity is the prior's, zero with `prior_velocity_sigma`.
+    of the inverse; the velocity is the prior's, at rest in the world with `prior_velocity_sigma`.
     """
     place = inverse_elevation_bearing_range(detection)
     root = inverse_jacobian(detection) * measurement_sigmas(params)
@@ -78,4 +79,5 @@ def initial_estimate(detection: jax.Array, params: Params) -> tuple[jax.Array, j
     of_velocity = jnp.broadcast_to(params.prior_velocity_sigma**2 * jnp.eye(3), of_place.shape)
     none = jnp.zeros_like(of_place)
     covariance = interleave_blocks(of_place, none, none, of_velocity)
-    return interleave(place, jnp.zeros_like(place)), covariance
+    at_rest = jnp.zeros_like(place) - platform_velocity(params)
+    return interleave(place, at_rest), covariance

@@ -106,8 +106,10 @@ class StaticParams:
                 raise ValueError(f"{field_name} = {chosen!r}: expected one of {', '.join(known)}")
 
 
-def _quantity(default: float, unit: str, low: float, high: float = LARGEST, open_low: bool = False) -> Any:
-    """A traced number with its unit and the range that `validate` allows."""
+def _quantity(
+    default: float | None, unit: str, low: float, high: float = LARGEST, open_low: bool = False
+) -> Any:
+    """A traced number with its unit and the range that `validate` allows; None where it may be unset."""
     return struct.field(
         default=default,
         metadata={"unit": unit, "low": low, "high": high, "open_low": open_low},
@@ -138,6 +140,12 @@ class Params:
     """Standard deviation of a truth's initial velocity, each axis (m/s)."""
     truth_process_noise: float = _quantity(1.0, "m^2/s^3", 0.0)
     """Spectral density of the truths' white acceleration; 0 switches it off (m^2/s^3)."""
+    truth_turn_rate: float | None = _quantity(None, "rad/s", 0.0, 1e3)
+    """Truths turn about the vertical: their rates are spread evenly from minus to plus this over the
+    rows (rad/s); unset, they do not."""
+    truth_acceleration: float | None = _quantity(None, "m/s^2", 0.0, 1e4)
+    """Every truth has a constant acceleration of this size, the rows' directions spread evenly over the
+    sphere (m/s^2); unset, none has."""
     initial_truths: int | None = None
     """Truths alive at the start; unset, all of them."""
     birth_rate: float = _quantity(0.0, "1/step", 0.0, 80.0)  # e^-80 is still a number in float32
@@ -147,6 +155,9 @@ class Params:
     trajectories: jax.Array | None = None
     """Recorded truths `[K, N, 6]` to replay instead of simulating; NaN where absent."""
 
+    platform_speed: float = _quantity(0.0, "m/s", 0.0)
+    """The radar's platform flies ahead, along its x axis, at this known speed; all positions and velocities
+    are relative to it (m/s)."""
     elevation_sigma: float = _quantity(2e-3, "rad", 0.0, math.pi, open_low=True)
     """Standard deviation of measured elevation (rad)."""
     bearing_sigma: float = _quantity(2e-3, "rad", 0.0, math.pi, open_low=True)
@@ -205,7 +216,9 @@ def validate(static: StaticParams, params: Params) -> None:
     """
     for field in dataclasses.fields(params):
         if field.metadata and "low" in field.metadata:
-            _check_quantity(field, getattr(params, field.name))
+            value = getattr(params, field.name)
+            if value is not None or field.default is not None:
+                _check_quantity(field, value)
     if np.any(np.asarray(params.min_range) > np.asarray(params.max_range)):
         raise ValueError(f"min_range = {params.min_range}: expected at most max_range = {params.max_range} m")
     if np.any(np.asarray(params.clutter_rate) > static.max_clutter):

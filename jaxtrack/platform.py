@@ -1,13 +1,19 @@
-"""A fixed platform somewhere else: everything in jaxtrack is in the frame of the radar's platform.
+"""The radar's platform somewhere else, or on its way: everything in jaxtrack is in the platform's frame.
 
 Counterpart in Stone Soup: `FixedPlatform` with a position and an orientation. Truths or
 trajectories given in another frame go through `to_platform` once, tracks come back through
 `from_platform`; in between the platform is at the origin and looks along x.
+
+A platform that flies straight on at a known speed (`Params.platform_speed`; Stone Soup's
+`MovingPlatform`) is at the origin too, as constant velocity is the same in its frame. What changes is
+that whatever is at rest in the world comes nearer: truths are born, and tracks initiated, with that
+mean velocity.
 """
 
 import jax
 import jax.numpy as jnp
 
+from jaxtrack.params import Params
 from jaxtrack.types import position, velocity
 
 
@@ -27,6 +33,11 @@ def from_platform(states: jax.Array, place: jax.Array, orientation: jax.Array) -
     """Inverse of `to_platform`, with the same arguments: states of the platform's frame in the world."""
     turn = rotation(orientation)
     return _interleaved(position(states) @ turn + place, velocity(states) @ turn)
+
+
+def platform_velocity(params: Params) -> jax.Array:
+    """Velocity `[3]` of the platform in the world, along its own axes (m/s)."""
+    return params.platform_speed * jnp.array([1.0, 0.0, 0.0])
 
 
 def rotation(orientation: jax.Array) -> jax.Array:

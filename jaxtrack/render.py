@@ -19,6 +19,7 @@ import numpy as np
 from jaxtrack.cli import LARGEST_SEED, parse, require_file, require_integer, run
 from jaxtrack.policies import POLICIES
 from jaxtrack.recording import Episode, record_episode
+from jaxtrack.scenarios import read_scenario
 from jaxtrack.scene import Scene
 
 if TYPE_CHECKING:
@@ -154,6 +155,8 @@ class Options:
 
     policy: str = "index"
     """Policy by name: random, static, coverage, stalest, scheduler, index, index_tuned, gain or sweep."""
+    scenario: str = "paper"
+    """Scenario by name, or a file: as in train.evaluate; the datasheet lists them."""
     seed: int = 0
     """Seed of the scenario and of the policy."""
     steps: int = 1000
@@ -188,7 +191,7 @@ def draw(options: Options) -> str:
     from jaxtrack.env import make
 
     started = time.perf_counter()
-    env, params = make()
+    env, params = make(**read_scenario(options.scenario))
     policy = POLICIES[options.policy](env.static, params)
     episode = record_episode(env, params, policy, jax.random.key(options.seed), options.steps)
     recorded = time.perf_counter()

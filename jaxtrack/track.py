@@ -42,6 +42,7 @@ TRACKER_FIELDS = (
     "kappa",
     "gate_threshold",
     "missed_distance",
+    "platform_speed",
     "prior_velocity_sigma",
     "deletion_threshold",
 )

@@ -1,7 +1,9 @@
-"""Where the targets are: constant velocity with white acceleration, births and deaths; or recordings.
+"""Where the targets are: straight, turning or accelerated flight, births and deaths; or recordings.
 
 Counterpart in Stone Soup: `MultiTargetGroundTruthSimulator`.
 """
+
+import math
 
 import jax
 import jax.numpy as jnp
@@ -9,6 +11,7 @@ from flax import struct
 
 from jaxtrack.models import direction, interleave
 from jaxtrack.params import Params, StaticParams
+from jaxtrack.platform import platform_velocity
 from jaxtrack.sampling import poisson_quantile
 from jaxtrack.types import Scalar, Truths, position, velocity
 
@@ -69,7 +72,7 @@ def born_state(angles: jax.Array, share: jax.Array, velocity: jax.Array, params:
     azimuth, elevation = params.field_limit * angles[:, 0], params.field_limit * angles[:, 1]
     distance = params.min_range + share * (params.max_range - params.min_range)
     positions = distance * direction(azimuth, elevation)
-    velocities = params.truth_velocity_sigma * velocity
+    velocities = params.truth_velocity_sigma * velocity - platform_velocity(params)
     return interleave(positions, velocities)
 
 
@@ -113,14 +116,60 @@ def end_truths(truths: Truths, uniform: jax.Array, params: Params) -> Truths:
 def move_truths(truths: Truths, noise: jax.Array, params: Params) -> Truths:
     """Moves the truths by one time step; `noise` `[N, 3, 2]` is standard normal."""
     factor = process_noise_factor(params.time_step, params.truth_process_noise)
-    p, v = position(truths.state), velocity(truths.state)
+    way, v = fly(velocity(truths.state), params)
     first, second = noise[..., 0], noise[..., 1]
     return truths.replace(
         state=interleave(
-            p + params.time_step * v + factor[0, 0] * first,
+            position(truths.state) + way + factor[0, 0] * first,
             v + factor[1, 0] * first + factor[1, 1] * second,
         )
     )
+
+
+def fly(velocities: jax.Array, params: Params) -> tuple[jax.Array, jax.Array]:
+    """One time step without noise: straight on, in a turn, or accelerated.
+
+    Args:
+        velocities: `[N, 3]` before it (m/s).
+        params: numbers of the scenario.
+
+    Returns:
+        The way `[N, 3]` that is flown (m), and the velocities after it (m/s).
+    """
+    rows, dt = velocities.shape[0], params.time_step
+    way, after = dt * velocities, velocities
+    if params.truth_turn_rate is not None:
+        way, after = turn(velocities, params.truth_turn_rate * jnp.linspace(-1.0, 1.0, rows), dt)
+    if params.truth_acceleration is not None:
+        acceleration = params.truth_acceleration * spread_directions(rows)
+        way, after = way + dt**2 / 2 * acceleration, after + dt * acceleration
+    return way, after
+
+
+def turn(velocities: jax.Array, rates: jax.Array, time_step: Scalar) -> tuple[jax.Array, jax.Array]:
+    """A coordinated turn about the vertical: way `[N, 3]` (m) and velocities after one time step.
+
+    Counterpart in Stone Soup: `KnownTurnRate` in x and y, constant velocity in z.
+
+    Args:
+        velocities: `[N, 3]` (m/s).
+        rates: `[N]`, positive to the left (rad/s).
+        time_step: (s).
+    """
+    angle = rates * time_step
+    sin, cos = jnp.sin(angle), jnp.cos(angle)
+    ahead = jnp.sinc(angle / jnp.pi)  # sin(angle) / angle, also at 0
+    aside = jnp.sinc(angle / (2 * jnp.pi)) * jnp.sin(angle / 2)  # (1 - cos(angle)) / angle
+    x, y, z = jnp.moveaxis(velocities, -1, 0)
+    way = time_step * jnp.stack([ahead * x - aside * y, aside * x + ahead * y, z], axis=-1)
+    return way, jnp.stack([cos * x - sin * y, sin * x + cos * y, z], axis=-1)
+
+
+def spread_directions(number: int) -> jax.Array:
+    """Unit vectors `[number, 3]`, evenly over the sphere (Fibonacci lattice)."""
+    row = jnp.arange(number)
+    height = (2 * row + 1) / number - 1
+    return direction(math.pi * (3 - math.sqrt(5)) * row, jnp.arcsin(height))
 
 
 def begin_truths(

@@ -165,7 +165,9 @@ def prior_state(params: Params) -> GaussianState:
     """Prior of a new track: only its velocity entries are ever used."""
     variance = np.zeros(STATE_DIM)
     variance[list(VELOCITY)] = params.prior_velocity_sigma**2
-    return GaussianState(np.zeros((STATE_DIM, 1)), np.diag(variance))
+    mean = np.zeros((STATE_DIM, 1))
+    mean[VELOCITY[0]] = -params.platform_speed
+    return GaussianState(mean, np.diag(variance))
 
 
 def step_duration(params: Params) -> datetime.timedelta:

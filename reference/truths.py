@@ -112,6 +112,7 @@ def initial_states(rng: np.random.Generator, count: int, params: Params) -> np.n
         [ground * np.cos(azimuth), ground * np.sin(azimuth), distance * np.sin(elevation)], axis=1
     )
     states[:, 1::2] = params.truth_velocity_sigma * rng.standard_normal((count, 3))
+    states[:, 1] -= params.platform_speed
     return states
 
 
@@ -142,6 +143,9 @@ def scripted_simulator(script: Script, params: Params) -> FieldTruths:
 
 
 def _simulator(states: np.ndarray, params: Params, **parts: Any) -> FieldTruths:
+    for name in ("truth_turn_rate", "truth_acceleration", "trajectories"):
+        if getattr(params, name) is not None:
+            raise ValueError(f"{name}: expected None, these truths fly straight")
     return FieldTruths(
         initial_state=GaussianState(np.zeros(STATE_DIM), np.eye(STATE_DIM), timestamp=EPOCH),
         timestep=step_duration(params),

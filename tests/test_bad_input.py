@@ -27,12 +27,14 @@ SMALL = {
     "num_looks": 5,
 }
 STEPS = 20
-# Everything happens: wide beam, false detections, births, deaths, the end of an episode.
+# Everything happens: wide beam, false detections, manoeuvres, births, deaths, the end of an episode.
 BUSY = Params(
     time_step=0.05,
     clutter_rate=0.5,
     beam_azimuth=0.6,
     beam_elevation=0.6,
+    truth_turn_rate=0.5,
+    truth_acceleration=5.0,
     initial_truths=2,
     birth_rate=0.05,
     death_probability=0.02,
@@ -116,6 +118,7 @@ def fitting(params, name):
     """Other numbers moved where they depend on the one by name."""
     low, high = float(params.min_range), float(params.max_range)
     other = {"min_range": {"max_range": max(low, high)}, "max_range": {"min_range": min(low, high)}}
+    other["time_step"] = {"truth_acceleration": 0.0}  # for days it leads beyond float32
     return params.replace(**other.get(name, {}), clutter_rate=min(float(params.clutter_rate), 2.0))
 
 

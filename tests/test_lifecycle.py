@@ -101,3 +101,12 @@ def test_the_first_estimate_inverts_the_measurement(row, x64):
     np.testing.assert_allclose(covariance[1::2, 1::2], 625.0 * np.eye(3))
     np.testing.assert_array_equal(covariance[0::2, 1::2], np.zeros((3, 3)))
     np.testing.assert_array_equal(covariance[1::2, 0::2], np.zeros((3, 3)))
+
+
+def test_a_track_begins_at_rest_in_the_world_whatever_the_platform_does():
+    mean, covariance = estimate(jnp.asarray(VALUES), Params(platform_speed=200.0))
+    at_rest, same = estimate(jnp.asarray(VALUES), Params())
+    np.testing.assert_array_equal(mean[:, 1::2], [[-200, 0, 0]] * 3)
+    assert not np.signbit(at_rest[:, 1::2]).any()
+    np.testing.assert_array_equal(mean[:, 0::2], at_rest[:, 0::2])
+    np.testing.assert_array_equal(covariance, same)

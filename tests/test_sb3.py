@@ -1,7 +1,6 @@
 """Both environments in Stable-Baselines3: its own checker and vector environment; `make sb3` installs it."""
 
 import re
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -119,13 +118,6 @@ def test_without_a_seed_every_run_is_another(sb3):
     other.reset()
     looks = np.full((2, 2), 2)
     assert not np.array_equal(one.step(looks)[0]["tracks"], other.step(looks)[0]["tracks"])
-
-
-def test_the_block_of_the_documentation_trains(capsys):
-    page = Path(__file__).parents[1] / "jaxtrack/README.md"
-    (block,) = re.findall(r"```python sb3\n(.*?)```", page.read_text(), re.DOTALL)
-    exec(compile(block, str(page), "exec"), {"__name__": "__main__"})
-    assert "total_timesteps" in capsys.readouterr().out
 
 
 def test_the_example_trains_on_both_and_prints_a_table(capsys):

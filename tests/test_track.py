@@ -120,7 +120,12 @@ def test_the_fields_are_exactly_those_that_the_tracker_uses(recorded):
         numbers(plain.replace(**dict.fromkeys(unused, math.nan))), numbers(plain), strict=True
     ):
         np.testing.assert_array_equal(ours, theirs)
-    changes = {"deletion_threshold": 1e6, "gate_threshold": 1e-3, "missed_distance": 1e-3}
+    changes = {
+        "deletion_threshold": 1e6,
+        "gate_threshold": 1e-3,
+        "missed_distance": 1e-3,
+        "platform_speed": 9.0,
+    }
     for name in track.TRACKER_FIELDS:
         changed = plain.replace(**{name: changes.get(name, 1.1 * getattr(plain, name))})
         pairs = zip(numbers(changed), numbers(plain), strict=True)

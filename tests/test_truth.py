@@ -208,3 +208,48 @@ def test_newborns_are_placed_as_at_the_start(born, params):
         gap = np.quantile(first[:, quantity], levels) - np.quantile(second[:, quantity], levels)
         assert np.abs(gap).max() < 0.05 * spread
     np.testing.assert_allclose(velocity(later.state).std(), params.truth_velocity_sigma, rtol=0.03)
+
+
+def flight(rows, steps, **numbers):
+    """States `[steps + 1, N, 6]` of truths that fly without noise from the same state."""
+    params = Params(truth_process_noise=0.0, **numbers)
+    start = jnp.broadcast_to(jnp.array([1000.0, 30, -200, -40, 50, 5]), (rows, 6))
+    states = [Truths(state=start, alive=jnp.ones(rows, dtype=bool))]
+    for _ in range(steps):
+        states.append(move(states[-1], jnp.ones((rows, 3, 2)), params))
+    return np.stack([truths.state for truths in states])
+
+
+def test_turning_truths_fly_circles_of_their_own_rate(x64):
+    """A full circle of the outer rows in eight steps, in opposite senses; the middle row flies straight."""
+    states = flight(3, 8, truth_turn_rate=np.pi / 4, time_step=1.0)
+    velocities = states[..., 1::2]
+    speed = np.linalg.norm(velocities, axis=-1)
+    np.testing.assert_allclose(speed, speed[0, 0], rtol=1e-12)
+    np.testing.assert_allclose(states[-1, ::2, :4], states[0, ::2, :4], atol=1e-9)
+    np.testing.assert_allclose(states[2, 2, [1, 3]], [40, 30], rtol=1e-12)  # to the left
+    np.testing.assert_allclose(states[2, 0, [1, 3]], [-40, -30], rtol=1e-12)
+    np.testing.assert_allclose(states[8, :, 4], 90.0)
+    np.testing.assert_array_equal(states[:, 1], flight(1, 8, time_step=1.0)[:, 0])
+
+
+def test_accelerated_truths_fly_parabolas_in_all_directions(x64):
+    rows, size, time = 50, 20.0, 4 * 0.5
+    moved = flight(rows, 4, truth_acceleration=size, time_step=0.5)[-1] - flight(1, 4, time_step=0.5)[-1]
+    np.testing.assert_allclose(np.linalg.norm(moved[:, 1::2], axis=-1), size * time, rtol=1e-12)
+    np.testing.assert_allclose(moved[:, 0::2], moved[:, 1::2] * time / 2, atol=1e-9)
+    directions = moved[:, 1::2] / (size * time)
+    np.testing.assert_allclose(directions.mean(axis=0), 0.0, atol=0.02)
+    np.testing.assert_allclose(directions.T @ directions / rows, np.eye(3) / 3, atol=0.02)
+
+
+def test_a_rate_or_an_acceleration_of_zero_is_straight_flight(x64):
+    still = flight(3, 2, truth_turn_rate=0.0, truth_acceleration=0.0)
+    np.testing.assert_allclose(still, flight(3, 2), rtol=1e-15)
+
+
+def test_what_rests_in_the_world_comes_nearer_to_a_flying_platform(static):
+    key, flying = jax.random.key(0), Params(platform_speed=200.0, truth_velocity_sigma=0.0)
+    truths = initiate(key, static, flying)
+    np.testing.assert_array_equal(velocity(truths.state), [[-200, 0, 0]] * 3)
+    np.testing.assert_array_equal(position(truths.state), position(initiate(key, static, Params()).state))

@@ -58,8 +58,9 @@ class EvaluateOptions:
     seed: int = COMPARED_SEED
     """Seed of the scenarios."""
     scenario: str = ""
-    """paper, clutter, slow, crowd, agile, births, or a .toml or .json file with fields of Params and
-    StaticParams; unset, that of the runs, or the paper's without a run."""
+    """Scenario by name (paper, clutter, births, agile, turning, accelerating, crowd, swarm, slow, flying,
+    continuous), or a .toml or .json file with fields of Params and StaticParams, or a .csv file of OpenSky
+    state vectors; unset, that of the runs, or the paper's without a run."""
     greedy: bool = False
     """Let agents take their most probable look instead of sampling."""
     out: Path | None = None

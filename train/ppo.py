@@ -16,6 +16,7 @@ from rich.progress import Progress
 
 from jaxtrack.cli import INTERRUPTED, parse, run, take_config, wide_console
 from jaxtrack.env import SearchTrack, make
+from jaxtrack.scenarios import read_scenario
 from train import learner
 from train.checkpoint import learner_shapes
 from train.config import TrainConfig, from_dict
@@ -29,6 +30,8 @@ from train.saved_run import read_config
 
 FAILED = 1
 LOST = "training diverged: {name} is {value} after update {update}"
+NOT_SAVED = ("resume", "scenario")
+"""Options that are no part of a run's configuration: what a scenario sets stands there as fields."""
 PROG = "python -m train.ppo"
 HELP = (
     "Trains an agent for SearchTrack-v0 by PPO, compares it with all baselines on the same "
@@ -43,6 +46,9 @@ class Options(TrainConfig):
 
     resume: str = ""
     """Folder of an interrupted run to continue; beside it only --evaluation-episodes may be given."""
+    scenario: str = ""
+    """Scenario by name (paper, clutter, births, agile, turning, accelerating, crowd, swarm, slow, flying), or
+    a .toml or .json file with fields of Params and StaticParams. It sets the defaults of these below."""
 
 
 def main(argv: Sequence[str]) -> int:
@@ -70,9 +76,12 @@ def open_run(argv: Sequence[str]) -> AbstractContextManager[Run]:
     values, rest = take_config(argv)
     options = _parse(from_dict(values), rest)
     if not options.resume:
+        if options.scenario:
+            options = _parse(on_scenario(from_dict(values), options.scenario), rest)
         return start_run(_config(options))
-    if values:
-        raise ValueError("config: expected none beside --resume, which takes the run's own")
+    for name, given in (("config", values), ("scenario", options.scenario)):
+        if given:
+            raise ValueError(f"{name}: expected none beside --resume, which takes the run's own")
     folder = Path(options.resume)
     own, _ = read_config(folder)
     wanted = _config(_parse(own, rest))
@@ -80,12 +89,25 @@ def open_run(argv: Sequence[str]) -> AbstractContextManager[Run]:
     return resume_run(folder, wanted.evaluation_episodes)
 
 
+def on_scenario(config: TrainConfig, name: str) -> TrainConfig:
+    """The configuration with the fields of a scenario.
+
+    Raises:
+        ValueError: naming what is wrong with the scenario.
+    """
+    fields = read_scenario(name)
+    if "trajectories" in fields:
+        raise ValueError(f"scenario = {name!r}: expected no recording, which config.json can not hold")
+    env, params = make(config.params, config.static, **fields)
+    return dataclasses.replace(config, static=env.static, params=params)
+
+
 def _parse(config: TrainConfig, argv: Sequence[str]) -> Options:
     return parse(Options(**vars(config)), argv, PROG, HELP)
 
 
 def _config(options: Options) -> TrainConfig:
-    return TrainConfig(**{name: value for name, value in vars(options).items() if name != "resume"})
+    return TrainConfig(**{name: value for name, value in vars(options).items() if name not in NOT_SAVED})
 
 
 def execute(run: Run, console: Console) -> int:

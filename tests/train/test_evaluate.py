@@ -18,7 +18,7 @@ from train import evaluate
 from train.config import TrainConfig
 from train.evaluate import COMPARED_SEED, baselines, check_shapes, group_runs
 from train.figures import FIGURES
-from train.scenarios import SCENARIOS, build_scenario
+from train.scenarios import build_scenario
 
 pytestmark = pytest.mark.usefixtures("quick_compilation")
 
@@ -88,9 +88,10 @@ def test_without_out_nothing_is_written(monkeypatch, tmp_path, capsys):
             "scheduler, index, index_tuned, gain, sweep, greedy, rollout, uncertainty",
         ),
         (["--policies"], "policies: expected at least one name, or a run"),
-        (["--scenario", "moon"], "scenario = 'moon': expected paper, clutter, slow, crowd, agile, births"),
+        (["--scenario", "moon"], "scenario = 'moon': expected paper, clutter, births, agile, turning, "),
+        (["--scenario", "moon.csv"], "scenario = 'moon.csv': No such file"),
         (["--scenario", "moon.toml"], "config = 'moon.toml': "),
-        (["--scenario", "wrong.json"], "params.nonsense: no such field"),
+        (["--scenario", "wrong.json"], "nonsense: no such field"),
         (["--scenario", "negative.json"], "time_step = -1: expected a number in (0"),
         (["--page", "results.md"], "page: expected a folder for its figures too, --out"),
         (["--episodes", "few"], "--episodes"),
@@ -112,22 +113,13 @@ def test_bad_input_is_one_line_and_code_2(monkeypatch, tmp_path, capsys, options
     assert sorted(tmp_path.iterdir()) == before
 
 
-@pytest.mark.parametrize("name", SCENARIOS)
-def test_scenarios_by_name_differ_from_the_papers_as_they_say(name):
-    env, params = build_scenario(name, [])
-    shapes = {field: value for field, value in SCENARIOS[name].items() if field == "num_truths"}
-    numbers = {field: value for field, value in SCENARIOS[name].items() if field not in shapes}
-    assert params == dataclasses.replace(TrainConfig().params, **numbers)
-    assert env.static == dataclasses.replace(TrainConfig().static, **shapes)
-
-
-def test_fields_may_stand_in_tables_or_alone(tmp_path):
-    (tmp_path / "mixed.json").write_text(
-        '{"num_looks": 5, "static": {"map_size": 9}, "clutter_rate": 0.5, "params": {"time_step": 1}}'
+def test_a_scenario_by_name_changes_its_fields_and_no_other_default():
+    env, params = build_scenario("swarm", [])
+    assert env.static == dataclasses.replace(
+        TrainConfig().static, num_truths=50, max_tracks=100, max_detections=20
     )
-    env, params = build_scenario(str(tmp_path / "mixed.json"), [])
-    assert (env.static.num_looks, env.static.map_size) == (5, 9)
-    assert (params.clutter_rate, params.time_step) == (0.5, 1)
+    assert params == TrainConfig().params
+    assert build_scenario("slow", [])[1] == dataclasses.replace(TrainConfig().params, time_step=0.05)
 
 
 def test_runs_bring_their_own_scenario_unless_one_is_named():

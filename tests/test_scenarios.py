@@ -1,0 +1,158 @@
+"""Scenarios by name: each trains, evaluates and renders; and what a name or a file is taken for."""
+
+import re
+
+import jax
+import numpy as np
+import pytest
+
+import jaxtrack
+from jaxtrack import render
+from jaxtrack.recording import record_episode
+from jaxtrack.scenarios import SCENARIOS, read_scenario
+from tests.aircraft_file import state_rows, write_states
+from tests.train.small_run import OPTIONS
+from train import evaluate, ppo
+from train.saved_run import read_config
+
+pytestmark = pytest.mark.usefixtures("quick_compilation")
+
+STEPS = 3
+NOT_TRAINED = ("continuous",)
+"""The agents choose discrete looks."""
+QUICK, QUICKLY_DRAWN = ("accelerating",), ("turning", "swarm", "flying", "continuous")
+"""Those that the quick tests play; the others run with -m slow."""
+OF_SCENARIOS = ("num-truths", "max-tracks", "max-detections", "max-clutter")
+SMALL = {name: value for name, value in OPTIONS.items() if name.removeprefix("static.") not in OF_SCENARIOS}
+WORDS = [word for option, value in SMALL.items() for word in (f"--{option}", str(value))]
+LEARN = ["--total-steps", "64", "--warm-start-steps", "32", "--evaluation-episodes", "0"]
+
+
+def each(names, quick=QUICK):
+    return [pytest.param(name, marks=() if name in quick else pytest.mark.slow) for name in names]
+
+
+def assert_has_fields(name, static, params):
+    made = vars(static) | vars(params)
+    assert {field: made[field] for field in SCENARIOS[name]} == SCENARIOS[name]
+
+
+@pytest.fixture
+def short(monkeypatch):
+    """Episodes of a few steps on a small map, whatever the scenario."""
+
+    def cut(name):
+        return {**read_scenario(name), "max_steps_in_episode": STEPS, "map_size": 6, "num_looks": 3}
+
+    for module in ("jaxtrack.render", "train.scenarios"):
+        monkeypatch.setattr(f"{module}.read_scenario", cut)
+
+
+@pytest.mark.parametrize("name", each(name for name in SCENARIOS if name not in NOT_TRAINED))
+def test_each_trains(name, tmp_path):
+    run = tmp_path / "run"
+    assert ppo.main(["--scenario", name, *WORDS, *LEARN, "--out", str(run)]) == 0
+    config, _ = read_config(run)
+    assert_has_fields(name, config.static, config.params)
+    assert len((run / "metrics.csv").read_text().splitlines()) == 3  # what is not finite ends it before
+
+
+@pytest.mark.parametrize("name", each(SCENARIOS))
+def test_each_evaluates(name, short, monkeypatch, capsys):
+    played, play = [], evaluate.play
+
+    def spy(competitors, env, params, *rest):
+        played.append((env.static, params))
+        return play(competitors, env, params, *rest)
+
+    monkeypatch.setattr(evaluate, "play", spy)
+    policies = ["--policies", "random", "index_tuned", "sweep"]
+    assert evaluate.main([*policies, "--episodes", "2", "--scenario", name]) == 0
+    assert "2 scenarios" in capsys.readouterr().out
+    assert_has_fields(name, *played[0])
+
+
+@pytest.mark.parametrize("name", each(SCENARIOS, QUICKLY_DRAWN))
+def test_each_renders(name, short, monkeypatch, tmp_path):
+    drawn, save_frame = [], render.save_frame
+
+    def spy(episode, path):
+        drawn.append(episode)
+        save_frame(episode, path)
+
+    monkeypatch.setattr(render, "save_frame", spy)
+    out = tmp_path / "last.png"
+    assert render.main(["--scenario", name, "--steps", str(STEPS), "--out", str(out)]) == 0
+    assert out.stat().st_size > 10_000
+    assert_has_fields(name, drawn[0].static, drawn[0].params)
+
+
+@pytest.mark.parametrize("name", SCENARIOS)
+def test_each_is_made_of_its_fields(name):
+    env, params = jaxtrack.make(**read_scenario(name))
+    assert_has_fields(name, env.static, params)
+
+
+@pytest.mark.parametrize("options", [evaluate.EvaluateOptions, ppo.Options])
+def test_every_help_names_them_all(options, capsys):
+    command = evaluate if options is evaluate.EvaluateOptions else ppo
+    with pytest.raises(SystemExit):
+        command.main(["--help"])
+    said = capsys.readouterr().out
+    trained = [name for name in SCENARIOS if command is evaluate or name not in NOT_TRAINED]
+    assert ", ".join(trained) in re.sub(r"[\s│]+", " ", said)
+
+
+def test_options_win_over_the_scenario_and_the_scenario_over_the_file(monkeypatch, tmp_path):
+    (tmp_path / "mine.toml").write_text("seed = 7\n[params]\nclutter_rate = 0.1\nrange_sigma = 9\n")
+    given = []
+    monkeypatch.setattr(ppo, "start_run", given.append)
+    options = ["--scenario", "clutter", "--config", str(tmp_path / "mine.toml")]
+    ppo.open_run([*options, "--params.detection-probability", "0.7"])
+    (config,) = given
+    params = config.params
+    assert (config.seed, params.clutter_rate, params.detection_probability) == (7, 0.2, 0.7)
+    assert (params.range_sigma, params.search_weight) == (9, 3.0)
+
+
+def test_what_can_not_be_trained_is_refused(tmp_path):
+    with pytest.raises(ValueError, match=r"^scenario: expected none beside --resume"):
+        ppo.open_run(["--resume", str(tmp_path), "--scenario", "slow"])
+    with pytest.raises(ValueError, match=r"^static.continuous_actions = True: expected False"):
+        ppo.open_run(["--scenario", "continuous", "--out", str(tmp_path / "run")]).__enter__()
+    recorded = write_states(tmp_path / "states.csv", state_rows(12))
+    with pytest.raises(ValueError, match=r"^scenario = '.*states.csv': expected no recording"):
+        ppo.open_run(["--scenario", str(recorded)])
+
+
+def test_fields_of_a_file_may_stand_in_tables_or_alone(tmp_path):
+    (tmp_path / "mixed.json").write_text(
+        '{"num_looks": 5, "static": {"map_size": 9}, "clutter_rate": 0.5, "info_metrics": ["gospa"]}'
+    )
+    assert read_scenario(str(tmp_path / "mixed.json")) == {
+        "num_looks": 5,
+        "map_size": 9,
+        "clutter_rate": 0.5,
+        "info_metrics": ("gospa",),
+    }
+    (tmp_path / "wrong.json").write_text('{"static": 3}')
+    with pytest.raises(ValueError, match=r"^static = 3: expected a table of fields"):
+        read_scenario(str(tmp_path / "wrong.json"))
+
+
+def test_the_aircraft_of_a_recording_are_the_truths(short, tmp_path):
+    recorded = write_states(tmp_path / "states.csv", state_rows(12))
+    env, params = jaxtrack.make(**read_scenario(str(recorded)))
+    assert 1 <= env.static.num_truths <= 4
+    key = jax.random.key(0)
+    episode = record_episode(env, params, lambda key, state: np.array([9, 9]), key, num_steps=2)
+    np.testing.assert_allclose(episode.states.truths.state, params.trajectories[1:3], rtol=1e-5)
+    out = tmp_path / "aircraft.png"
+    assert render.main(["--scenario", str(recorded), "--steps", "2", "--out", str(out)]) == 0
+    assert out.stat().st_size > 10_000
+
+
+@pytest.mark.parametrize("name", ["moon", "paper.txt", ""])
+def test_another_name_is_refused_with_all_that_exist(name):
+    with pytest.raises(ValueError, match=f"^scenario = '{name}': expected {', '.join(SCENARIOS)}, or a"):
+        read_scenario(name)
