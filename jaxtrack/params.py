@@ -145,7 +145,7 @@ class StaticParams:
 def _quantity(
     default: float | None, unit: str, low: float, high: float = LARGEST, open_low: bool = False
 ) -> Any:
-    """A traced number with its unit and the range that `validate` allows; without a default it may be unset."""
+    """A traced number with its unit and the range that `validate` allows; without a default, may be unset."""
     return struct.field(
         default=default,
         metadata={"unit": unit, "low": low, "high": high, "open_low": open_low},

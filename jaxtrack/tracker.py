@@ -147,18 +147,18 @@ def _initiate_confirmed(
     static: StaticParams,
     params: Params,
 ) -> tuple[Tracks, jax.Array]:
-    """Follows the tentative tracks, and takes over those with enough detections (`MultiMeasurementInitiator`).
+    """Follows the tentative tracks, and takes over those with enough detections.
 
-    They have a tracker of their own, of the same parts, which gets the `detections` that no track
+    Stone Soup's `MultiMeasurementInitiator`. They have a tracker of their own, of the same parts, which gets the `detections` that no track
     used. Its own new tracks are not checked on the step of their birth, so that `min_points` = 1
     means: on the step after it.
     """
-    assert tracks.tentative is not None
+    if tracks.tentative is None:
+        raise ValueError("tracks.tentative = None: expected a list that began as lifecycle.no_tracks(...)")
     tentative, detections = _blank_empty_rows(tracks.tentative, detections, params)
     predicted = kalman.predict(tentative, time_step, params)
     _, _, associated, updated = _follow(predicted, detections, static, params)
-    assert updated.counts is not None
-    confirmed = updated.active & (updated.counts.hits >= static.min_points)
+    confirmed = updated.active & (lifecycle.counts_of(updated).hits >= static.min_points)
     tracks, num_dropped = lifecycle.take_over(tracks, updated, confirmed)
     held = lifecycle.delete_tracks(updated.replace(active=updated.active & ~confirmed), static, params)
     new = lifecycle.unassociated(detections, associated)
