@@ -149,9 +149,9 @@ def _initiate_confirmed(
 ) -> tuple[Tracks, jax.Array]:
     """Follows the tentative tracks, and takes over those with enough detections.
 
-    Stone Soup's `MultiMeasurementInitiator`. They have a tracker of their own, of the same parts, which gets the `detections` that no track
-    used. Its own new tracks are not checked on the step of their birth, so that `min_points` = 1
-    means: on the step after it.
+    Stone Soup's `MultiMeasurementInitiator`. They have a tracker of their own, of the same parts, which
+    gets the `detections` that no track used. A tentative track is not looked at on the step of its birth,
+    so that `min_points` = 1 means: on the step after it.
     """
     if tracks.tentative is None:
         raise ValueError("tracks.tentative = None: expected a list that began as lifecycle.no_tracks(...)")
