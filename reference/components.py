@@ -82,10 +82,23 @@ ASSOCIATORS: dict[str, type[DataAssociator]] = {
 }
 """Stock associators by the names of `jaxtrack.association.ASSOCIATORS`."""
 
+
+def update_time_deleter(params: Params) -> UpdateTimeDeleter:
+    """Deletes tracks whose last detection is long ago."""
+    assert params.deletion_time is not None
+    return UpdateTimeDeleter(time_since_update=datetime.timedelta(seconds=float(params.deletion_time)))
+
+
+def update_time_steps_deleter(params: Params) -> UpdateTimeStepsDeleter:
+    """Deletes tracks that were missed many steps in a row."""
+    assert params.deletion_steps is not None
+    return UpdateTimeStepsDeleter(time_steps_since_update=int(params.deletion_steps))
+
+
 DELETERS: dict[str, Callable[[Params], Deleter]] = {
     "covariance": lambda params: CovarianceBasedDeleter(covar_trace_thresh=params.deletion_threshold),
-    "update_time": lambda params: UpdateTimeDeleter(datetime.timedelta(seconds=float(params.deletion_time))),
-    "update_time_steps": lambda params: UpdateTimeStepsDeleter(int(params.deletion_steps)),
+    "update_time": update_time_deleter,
+    "update_time_steps": update_time_steps_deleter,
 }
 """Stock deleters by the names of `jaxtrack.lifecycle.DELETERS`."""
 
