@@ -67,7 +67,7 @@ QUICK: dict[str, Any] = {
     "episodes": 12,
     "scenarios": 8,
     "steps": 40,
-    "part_episodes": 3,
+    "part_episodes": 2,
     "samples": 60,
     "records": 3,
     "environments": 4,
