@@ -170,11 +170,11 @@ def test_slots_of_tentative_tracks_grow_and_shrink_without_a_trace(recorded, mon
 
 
 def test_tentative_tracks_need_room_too(monkeypatch):
-    """None of twelve is ever confirmed, and none is dropped: a thirteenth is."""
+    """Twelve tentative tracks and no other, kept from call to call; then all are seen again."""
     monkeypatch.setattr(tracking, "SMALLEST", 8)
     places = np.array([[0.1, 0.25 * k, 2000.0 + 300 * k] for k in range(12)])
-    scans = [*places[:, None], places[:1]]
-    recorded = RecordedDetections.from_scans(0.01 * np.arange(13), scans)
+    recorded = RecordedDetections.from_scans(0.01 * np.arange(13), [*places[:, None], places])
     rows = table(track_scans(recorded, PARAMS, 3, StaticParams(initiator="multi_measurement")))
-    assert rows["scan"].tolist() == [12]
-    np.testing.assert_allclose(rows["mean"][0, 4], 2000 * np.sin(0.1), atol=1.0)
+    assert rows["scan"].tolist() == [12] * 12
+    assert rows["track"].tolist() == rows["detection"].tolist() == list(range(12))
+    np.testing.assert_allclose(rows["mean"][:, 4], places[:, 2] * np.sin(0.1), atol=1.0)
