@@ -1,7 +1,7 @@
 """Which detection belongs to which track.
 
 Counterparts in Stone Soup: `DistanceHypothesiser` with a `Measure`, `DistanceGater`,
-`NearestNeighbour`.
+`NearestNeighbour`, `GNNWith2DAssignment`.
 """
 
 from collections.abc import Callable
@@ -9,12 +9,13 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 
+from jaxtrack.assignment import assign
 from jaxtrack.kalman import ExpectedDetections
 from jaxtrack.kernel import add_up
 from jaxtrack.matrices import batch_first, batch_last, determinant_3x3, inverse_3x3
-from jaxtrack.models import measurement_noise, wrap_detection
+from jaxtrack.models import measurement_noise
 from jaxtrack.params import Params
-from jaxtrack.types import DETECTION_DIM, NO_DETECTION, Detections, Tracks
+from jaxtrack.types import DETECTION_DIM, NO_DETECTION, Detections, Scalar, Tracks
 
 Measure = Callable[[ExpectedDetections, Detections, Params], jax.Array]
 """Distances `[T, D]` of every detection from every track's expectation."""
@@ -89,7 +90,7 @@ def _determinants(matrices: jax.Array) -> jax.Array:
 
 def _differences(expected: ExpectedDetections, detections: Detections) -> jax.Array:
     """``wrap(zbar - z)`` `[T, D, 3]`."""
-    return wrap_detection(expected.mean[:, None] - detections.value[None])
+    return expected.innovation(expected.mean[:, None] - detections.value[None])
 
 
 def _quadratic(d: jax.Array, matrix: jax.Array) -> jax.Array:
@@ -141,3 +142,32 @@ def associate_nearest_neighbour(admissible: jax.Array) -> jax.Array:
     # Which pairs are chosen has no gradient; the update that follows does.
     left = jax.lax.stop_gradient(admissible)
     return jax.lax.while_loop(any_left, take_nearest, (left, nothing))[1]
+
+
+def associate_global_nearest_neighbour(admissible: jax.Array, missed_distance: Scalar) -> jax.Array:
+    """Assignment of gated distances `[T, D]` with the least total distance (`GNNWith2DAssignment`).
+
+    Every track without a detection adds `missed_distance`, so a pair is worth what it falls short of
+    that. `GlobalNearestNeighbour` minimises the same total, by trying all combinations.
+
+    Returns:
+        `[T]` index of each track's detection, or `NO_DETECTION`.
+    """
+    left = jax.lax.stop_gradient(admissible)
+    # A pair that is not admissible costs as much as a missed detection, and means one.
+    costs = jnp.where(jnp.isfinite(left), left - missed_distance, 0.0)
+    columns = assign(costs)
+    found = jnp.any((columns[:, None] == jnp.arange(costs.shape[1])) & jnp.isfinite(left), axis=1)
+    return jnp.where(found, columns, NO_DETECTION)
+
+
+Associator = Callable[[jax.Array, Params], jax.Array]
+"""Detection `[T]` of every track from gated distances `[T, D]`."""
+
+ASSOCIATORS: dict[str, Associator] = {
+    "nearest_neighbour": lambda admissible, params: associate_nearest_neighbour(admissible),
+    "global_nearest_neighbour": lambda admissible, params: associate_global_nearest_neighbour(
+        admissible, params.missed_distance
+    ),
+}
+"""Associators by name."""

@@ -10,9 +10,9 @@ import jax.numpy as jnp
 from gymnax.environments import environment
 
 from jaxtrack import metrics, spaces, tracker
-from jaxtrack.association import MEASURES
 from jaxtrack.episode import EnvState, StepNoise, StepRecord, sample_step_noise
 from jaxtrack.kernel import Function, one_by_one, rarely
+from jaxtrack.lifecycle import no_tracks
 from jaxtrack.observation import TRACK_FEATURES, Observation, observe
 from jaxtrack.params import Params, StaticParams, check_trajectories, validate
 from jaxtrack.reward import reward_terms
@@ -20,7 +20,6 @@ from jaxtrack.sampling import split
 from jaxtrack.scan_map import initial_scan_map, mean_scan_value, update_scan_map
 from jaxtrack.sensor import detect, look_angles
 from jaxtrack.truth import initiate_truths, propagate_truths
-from jaxtrack.types import Tracks
 
 ENV_ID = "SearchTrack-v0"
 
@@ -95,7 +94,7 @@ class SearchTrack(environment.Environment[EnvState, Params]):
         return EnvState(
             time=jnp.asarray(0, dtype=int),
             truths=truths,
-            tracks=Tracks.empty(self.static.max_tracks),
+            tracks=no_tracks(self.static.max_tracks, self.static),
             scan_map=initial_scan_map(self.static),
             num_born=jnp.sum(truths.alive),
             num_initiated=jnp.asarray(0, dtype=int),
@@ -148,8 +147,7 @@ class SearchTrack(environment.Environment[EnvState, Params]):
         truths, num_born, rowless = propagate_truths(state.truths, state.num_born, noise.truths, time, params)
         look = look_angles(action, self.static, params)
         detections, num_dropped = detect(truths, look, noise.sensor, self.static, params)
-        measure = MEASURES[self.static.measure]
-        tracks, info = tracker.step(state.tracks, detections, params.time_step, time, params, measure)
+        tracks, info = tracker.step(state.tracks, detections, params.time_step, time, params, self.static)
         num_initiated = state.num_initiated + jnp.sum(info.initiated)
         state = EnvState(time, truths, tracks, state.scan_map, num_born, num_initiated)
         return state, StepRecord(look, detections, rowless, num_dropped, info.num_dropped, info)

@@ -166,6 +166,20 @@ def inverse_elevation_bearing_range(detection: jax.Array) -> jax.Array:
     return detection[..., 2:3] * direction(detection[..., 1], detection[..., 0])
 
 
+def position_jacobian(points: jax.Array) -> jax.Array:
+    """Derivative `[..., 3, 3]` of (elevation, bearing, range) by the position at `points` `[..., 3]` (m).
+
+    Exact. Stone Soup's `CartesianToElevationBearingRange.jacobian` takes finite differences.
+    """
+    x, y, z = jnp.moveaxis(points, -1, 0)
+    ground = jnp.sqrt(x**2 + y**2)
+    slant = jnp.sqrt(x**2 + y**2 + z**2)
+    by_elevation = [-x * z / (ground * slant**2), -y * z / (ground * slant**2), ground / slant**2]
+    by_bearing = [-y / ground**2, x / ground**2, jnp.zeros_like(x)]
+    rows = [by_elevation, by_bearing, [x / slant, y / slant, z / slant]]
+    return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
+
+
 def inverse_jacobian(detection: jax.Array) -> jax.Array:
     """Derivative `[..., 3, 3]` of the position by (elevation, bearing, range) at detections `[..., 3]`.
 

@@ -32,6 +32,12 @@ MEASURES = (
     "hellinger",
     "squared_hellinger",
 )
+FILTERS = ("unscented", "extended", "cubature", "converted")
+ASSOCIATORS = ("nearest_neighbour", "global_nearest_neighbour")
+DELETERS = ("covariance", "update_time", "update_time_steps")
+INITIATORS = ("single_measurement", "multi_measurement")
+CONVERTED_MEASURES = ("mahalanobis", "squared_mahalanobis", "euclidean")
+"""Measures for the filter `converted`: those that need no noise of one size for all detections."""
 
 LARGEST = 1e9
 """Largest number allowed where nothing smaller is: its fourth power is still a number in float32."""
@@ -84,6 +90,21 @@ class StaticParams:
     measure: str = "mahalanobis"
     """Distance of a detection from a track: mahalanobis, squared_mahalanobis, euclidean,
     kullback_leibler, hellinger or squared_hellinger; the gate has its unit."""
+    filter: str = "unscented"
+    """Kalman filter of the tracks: unscented, extended, cubature, or converted (linear, on detections
+    converted to positions)."""
+    associator: str = "nearest_neighbour"
+    """Which detection belongs to which track: nearest_neighbour (greedy) or global_nearest_neighbour
+    (the least total distance)."""
+    deleters: tuple[str, ...] = ("covariance",)
+    """What deletes a track, one or more of: covariance, update_time, update_time_steps."""
+    intersect_deleters: bool = False
+    """A track is deleted only if all `deleters` say so, instead of any of them."""
+    initiator: str = "single_measurement"
+    """single_measurement: every detection of no track is a new track. multi_measurement: it is a tentative
+    one, which enters the track list after `min_points` detections."""
+    min_points: int = 2
+    """Detections that a tentative track needs to enter the track list."""
 
     def __post_init__(self) -> None:
         """Refuses shapes that make no sense, naming the field."""
@@ -96,14 +117,29 @@ class StaticParams:
                     raise ValueError(f"{field.name} = {value!r}: expected an integer in [{low}, {high}]")
             elif field.type is bool and not isinstance(value, bool):
                 raise ValueError(f"{field.name} = {value!r}: expected True or False")
-        if not isinstance(self.info_metrics, tuple):
-            raise ValueError(f"info_metrics = {self.info_metrics!r}: expected a tuple of names")
-        choices = [("reward", self.reward, REWARDS), ("measure", self.measure, MEASURES)]
+        for name in ("info_metrics", "deleters"):
+            if not isinstance(getattr(self, name), tuple):
+                raise ValueError(f"{name} = {getattr(self, name)!r}: expected a tuple of names")
+        if not self.deleters:
+            raise ValueError(f"deleters = (): expected one or more of {', '.join(DELETERS)}")
+        choices: list[tuple[str, Any, tuple[str, ...]]] = [
+            ("reward", self.reward, REWARDS),
+            ("measure", self.measure, MEASURES),
+            ("filter", self.filter, FILTERS),
+            ("associator", self.associator, ASSOCIATORS),
+            ("initiator", self.initiator, INITIATORS),
+        ]
+        choices += [("deleters", name, DELETERS) for name in self.deleters]
         choices += [("info_metrics", name, METRICS) for name in self.info_metrics]
         choices += [("stop_metric", self.stop_metric, METRICS)] if self.stop_metric is not None else []
         for field_name, chosen, known in choices:
             if not isinstance(chosen, str) or chosen not in known:
                 raise ValueError(f"{field_name} = {chosen!r}: expected one of {', '.join(known)}")
+        if self.filter == "converted" and self.measure not in CONVERTED_MEASURES:
+            raise ValueError(
+                f"measure = {self.measure!r}: expected one of {', '.join(CONVERTED_MEASURES)} "
+                "with filter = 'converted'"
+            )
 
 
 def _quantity(
@@ -184,7 +220,11 @@ class Params:
     prior_velocity_sigma: float = _quantity(30.0, "m/s", 0.0, open_low=True)
     """Standard deviation of a new track's velocity, each axis (m/s)."""
     deletion_threshold: float = _quantity(5_000.0, "m^2 + m^2/s^2", 0.0, 1e18, open_low=True)
-    """A track is deleted when the trace of its covariance exceeds this."""
+    """Deleter covariance: a track is deleted when the trace of its covariance exceeds this."""
+    deletion_time: float | None = _quantity(None, "s", 0.0, 1000.0, open_low=True)
+    """Deleter update_time: a track is deleted when its last detection is longer ago than this (s)."""
+    deletion_steps: int | None = _quantity(None, "steps", 1, 1e6)
+    """Deleter update_time_steps: a track is deleted after this many steps in a row without a detection."""
 
     scan_time_constant: float = _quantity(1.0, "s", 0.0, open_low=True)
     """Time in which the scan value of an unobserved direction recovers to 1 - 1/e (s)."""
@@ -226,6 +266,7 @@ def validate(static: StaticParams, params: Params) -> None:
             f"clutter_rate = {params.clutter_rate}: expected at most max_clutter = "
             f"{static.max_clutter} 1/look"
         )
+    _check_deleters(static, params)
     _check_stop(static, params)
     _check_initial_truths(static, params)
     check_trajectories(static, params)
@@ -251,6 +292,12 @@ def _check_recording(params: Params) -> None:
         raise ValueError(
             f"trajectories: expected numbers in [{-LARGEST:g}, {LARGEST:g}] (m, m/s), or NaN where absent"
         )
+
+
+def _check_deleters(static: StaticParams, params: Params) -> None:
+    for deleter, name in (("update_time", "deletion_time"), ("update_time_steps", "deletion_steps")):
+        if deleter in static.deleters and getattr(params, name) is None:
+            raise ValueError(f"{name} = None: expected a number for deleters = {static.deleters!r}")
 
 
 def _check_stop(static: StaticParams, params: Params) -> None:

@@ -29,10 +29,11 @@ def covariance_reduction(
     The paper prints the difference the other way round, which pays for growth, while its
     text says reduction: this follows the text. Divided by the deletion threshold.
     """
-    del truths, static
+    del truths
     detected = (after.updated_by != NO_DETECTION) | (before.updated_by != NO_DETECTION)
     # A track born now has no norm before; its slot may have held another track.
-    counts = after.active & detected & (after.age > 0)
+    counts = after.active & detected
+    counts &= _same_tracks(before, after) if _can_enter_late(static) else after.age > 0
     fall = covariance_norms(before) - covariance_norms(after)
     return jnp.sum(jnp.where(counts, fall, 0.0)) / params.deletion_threshold
 
@@ -70,7 +71,9 @@ def shortfall(
     trace = jnp.trace(after.covariance, axis1=-2, axis2=-1)
     cost = jnp.minimum(1.0, trace / params.deletion_threshold)
     # A slot may hold a new track already.
-    kept = after.active & (after.birth_step == before.birth_step)
+    kept = after.active & (
+        _same_tracks(before, after) if _can_enter_late(static) else after.birth_step == before.birth_step
+    )
     deleted = jnp.sum(before.active & ~kept)
     return -(jnp.sum(jnp.where(after.active, cost, 0.0)) + LOST_STEPS * deleted) / static.num_truths
 
@@ -87,6 +90,17 @@ def accuracy(
     num_truths = jnp.maximum(jnp.sum(truths.alive), 1)
     worst = params.gospa_cutoff * (num_truths / 2) ** (1 / params.gospa_order)
     return 1 - gospa(truths, after, params).distance / worst
+
+
+def _can_enter_late(static: StaticParams) -> bool:
+    """Whether a track can enter the list some steps after its birth."""
+    return static.initiator == "multi_measurement"
+
+
+def _same_tracks(before: Tracks, after: Tracks) -> jax.Array:
+    """`[T]` whether a slot held, before the step, the track that it holds after it."""
+    same_step = before.birth_step == after.birth_step
+    return before.active & same_step & (before.birth_detection == after.birth_detection)
 
 
 TRACK_TERMS: dict[str, TrackTerm] = {

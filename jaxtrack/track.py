@@ -27,9 +27,21 @@ from rich.progress import (
 
 from jaxtrack.cli import parse, require_file, run, take_config
 from jaxtrack.detection_file import RecordedDetections, read_detections
-from jaxtrack.params import Params, StaticParams, allowed_range, validate, with_unit
+from jaxtrack.params import (
+    ASSOCIATORS,
+    DELETERS,
+    FILTERS,
+    INITIATORS,
+    MEASURES,
+    Params,
+    StaticParams,
+    allowed_range,
+    validate,
+    with_unit,
+)
 from jaxtrack.track_file import TrackWriter, partial_path
 from jaxtrack.track_plot import SUFFIXES, TrackPaths
+from jaxtrack.tracker import DEFAULT
 from jaxtrack.tracking import track_scans
 
 TRACKER_FIELDS = (
@@ -45,8 +57,21 @@ TRACKER_FIELDS = (
     "platform_speed",
     "prior_velocity_sigma",
     "deletion_threshold",
+    "deletion_time",
+    "deletion_steps",
 )
 """The fields of `Params` that the tracker uses on recorded detections."""
+
+TRACKER_CHOICES = {
+    "filter": FILTERS,
+    "measure": MEASURES,
+    "associator": ASSOCIATORS,
+    "deleters": DELETERS,
+    "intersect_deleters": ("true", "false"),
+    "initiator": INITIATORS,
+    "min_points": (),
+}
+"""The fields of `StaticParams` that it uses, and what they may be."""
 
 HELP = """\
 Runs the tracker over recorded detections.
@@ -56,7 +81,7 @@ Intervals may be uneven, and times as large as seconds since 1970.
 It writes one row for each live track and scan: time, track (0, 1, ... in order of birth), x, vx, y, vy,
 z, vz (m, m/s), the upper triangle p00, p01, ... p55 of their covariance, and detection (row within the
 scan, from 0; empty where the scan had none for the track).
---config FILE (.toml or .json) sets numbers of the tracker; --set wins over it. They are, with defaults:
+--config FILE (.toml or .json) sets numbers and parts of the tracker; --set wins over it.
 """
 
 
@@ -69,7 +94,7 @@ class Options:
     out: Path = tyro.MISSING
     """CSV file to write."""
     set: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
-    """A number of the tracker as name=value, from the list above."""
+    """A number or part of the tracker as name=value, from the lists above."""
     plot: Path | None = None
     """Picture of the tracks to draw: .png, .pdf or .svg."""
 
@@ -78,13 +103,17 @@ def main(argv: Sequence[str]) -> int:
     """The command; returns the exit code."""
     values, rest = take_config(argv)
     options = parse(Options(), rest, "python -m jaxtrack.track", help_text())
-    params = build_params({**values, **read_settings(options.set)})
+    values = {**values, **read_settings(options.set)}
+    static = build_static({name: value for name, value in values.items() if name in TRACKER_CHOICES})
+    params = build_params(
+        {name: value for name, value in values.items() if name not in TRACKER_CHOICES}, static
+    )
     check_files(options)
     with jax.enable_x64(True):
         recorded = read_detections(options.detections)
         if recorded.ignored:
             print(f"{options.detections}: ignored columns {', '.join(recorded.ignored)}", file=sys.stderr)
-        print(track_file(recorded, params, options))
+        print(track_file(recorded, params, options, static))
     return 0
 
 
@@ -108,7 +137,9 @@ class Summary:
         )
 
 
-def track_file(recorded: RecordedDetections, params: Params, options: Options) -> Summary:
+def track_file(
+    recorded: RecordedDetections, params: Params, options: Options, static: StaticParams = DEFAULT
+) -> Summary:
     """Tracks, writes, and draws; what is done stays in the partial file if it is interrupted."""
     started, scans, tracks, compiling = time.perf_counter(), 0, 0, 0.0
     paths = TrackPaths(recorded) if options.plot else None
@@ -116,7 +147,7 @@ def track_file(recorded: RecordedDetections, params: Params, options: Options) -
         with (
             TrackWriter(options.out, recorded.label) as writer,
             _progress() as progress,
-            contextlib.closing(track_scans(recorded, params)) as chunks,
+            contextlib.closing(track_scans(recorded, params, static=static)) as chunks,
         ):
             task = progress.add_task("tracking", total=len(recorded.time), speed="compiling")
             for rows in chunks:
@@ -136,7 +167,26 @@ def track_file(recorded: RecordedDetections, params: Params, options: Options) -
     return Summary(options.out, scans, len(recorded.value), tracks, seconds, compiling)
 
 
-def build_params(values: dict[str, Any]) -> Params:
+def build_static(values: dict[str, Any]) -> StaticParams:
+    """The tracker's parts with these changed; of words, `deleters` are separated by commas.
+
+    Raises:
+        ValueError: naming a field and what it may be.
+    """
+    parts = dict(values)
+    if isinstance(parts.get("deleters"), str):
+        parts["deleters"] = tuple(name.strip() for name in parts["deleters"].split(","))
+    elif isinstance(parts.get("deleters"), list):
+        parts["deleters"] = tuple(parts["deleters"])
+    word = parts.get("intersect_deleters")
+    if isinstance(word, str) and word.lower() in ("true", "false"):
+        parts["intersect_deleters"] = word.lower() == "true"
+    if isinstance(parts.get("min_points"), str) and parts["min_points"].isdecimal():
+        parts["min_points"] = int(parts["min_points"])
+    return StaticParams(**parts)
+
+
+def build_params(values: dict[str, Any], static: StaticParams = DEFAULT) -> Params:
     """The tracker's numbers with these changed.
 
     Raises:
@@ -144,11 +194,12 @@ def build_params(values: dict[str, Any]) -> Params:
     """
     for name, value in values.items():
         if name not in TRACKER_FIELDS:
-            raise ValueError(f"{name}: no number of the tracker; expected one of {', '.join(TRACKER_FIELDS)}")
+            known = ", ".join([*TRACKER_FIELDS, *TRACKER_CHOICES])
+            raise ValueError(f"{name}: no number of the tracker; expected one of {known}")
         if isinstance(value, (bool, list, dict)) or value is None:
             raise ValueError(f"{name} = {value!r}: expected a number")
     params = Params(**{name: _as_float(value) for name, value in values.items()})
-    validate(StaticParams(), params)
+    validate(static, params)
     return params
 
 
@@ -188,12 +239,17 @@ def check_files(options: Options) -> None:
 
 
 def help_text() -> str:
-    """What the command does, and the list of the tracker's numbers."""
-    lines = [HELP]
+    """What the command does, and the lists of the tracker's numbers and parts."""
+    lines = [HELP, "Numbers, with defaults:"]
     for field in dataclasses.fields(Params):
         if field.name in TRACKER_FIELDS:
-            default = with_unit(f"{field.default:g}", field)
+            default = "unset" if field.default is None else with_unit(f"{field.default:g}", field)
             lines.append(f"  {field.name} = {default}, in {allowed_range(field)}")
+    lines.append("Parts, with defaults:")
+    for name, choices in TRACKER_CHOICES.items():
+        value = getattr(DEFAULT, name)
+        text = ",".join(value) if isinstance(value, tuple) else str(value).lower()
+        lines.append(f"  {name} = {text}{', of ' + ', '.join(choices) if choices else ''}")
     return "\n".join(lines)
 
 

@@ -1,16 +1,17 @@
 """One cycle of the multi-target tracker. It stands alone: no environment is needed.
 
-Counterpart in Stone Soup: `MultiTargetTracker`.
+Counterpart in Stone Soup: `MultiTargetTracker`. Its parts are chosen by name in `StaticParams`: measure,
+filter, associator, deleters and initiator.
 """
 
 import jax
 import jax.numpy as jnp
 from flax import struct
 
-from jaxtrack import association, kalman, lifecycle
-from jaxtrack.association import Measure, mahalanobis
-from jaxtrack.kalman import ExpectedDetections
-from jaxtrack.params import Params
+from jaxtrack import association, converted, kalman, lifecycle
+from jaxtrack.association import ASSOCIATORS, MEASURES
+from jaxtrack.kalman import FILTERS, ExpectedDetections
+from jaxtrack.params import Params, StaticParams
 from jaxtrack.types import STATE_DIM, Detections, Scalar, Tracks, where_rows
 
 
@@ -24,8 +25,8 @@ class TrackerInfo(struct.PyTreeNode):
         associated: `[T]` index of each track's detection, or `NO_DETECTION`.
         updated: the track list after the update, before deletion.
         deleted: `[T]` which tracks were deleted on this step.
-        initiated: `[T]` which slots hold a track born on this step.
-        num_dropped: new tracks for which no slot was free.
+        initiated: `[T]` which slots hold a track that is new in the list on this step.
+        num_dropped: new tracks for which no slot was free, tentative ones included.
     """
 
     predicted: Tracks
@@ -38,41 +39,40 @@ class TrackerInfo(struct.PyTreeNode):
     num_dropped: jax.Array  # [] int
 
 
+DEFAULT = StaticParams()
+
+
 def step(
     tracks: Tracks,
     detections: Detections,
     time_step: Scalar,
     index: jax.Array,
     params: Params,
-    measure: Measure = mahalanobis,
+    static: StaticParams = DEFAULT,
 ) -> tuple[Tracks, TrackerInfo]:
     """Predict, gate, associate, update, delete, initiate: in Stone Soup's order.
 
     Args:
-        tracks: the track list after the previous step.
+        tracks: the track list after the previous step; the first one is `lifecycle.no_tracks`.
         detections: what the look returned; none active is fine.
         time_step: time since the previous step (s).
         index: number of this step, which becomes the birth step of new tracks.
         params: numbers of the tracker.
-        measure: distance of a detection from a track, one of `association.MEASURES`.
+        static: the parts that the tracker is made of; no shape is read.
 
     Returns:
         The track list after this step, and all intermediates.
     """
     tracks, detections = _blank_empty_rows(tracks, detections, params)
     predicted = kalman.predict(tracks, time_step, params)
-    expected, distances, associated, updated = jax.lax.cond(
-        jnp.any(detections.active),
-        lambda: _associate_and_update(predicted, detections, params, measure),
-        lambda: _coast(predicted, detections, params, measure),
-    )
-    surviving = lifecycle.delete_uncertain_tracks(updated, params)
+    expected, distances, associated, updated = _follow(predicted, detections, static, params)
+    surviving = lifecycle.delete_tracks(updated, static, params)
     new = lifecycle.unassociated(detections, associated)
-    tracks, num_dropped = jax.lax.cond(
-        jnp.any(new),
-        lambda: lifecycle.initiate_tracks(surviving, detections, new, index, params),
-        lambda: (surviving, jnp.asarray(0)),
-    )
+    if static.initiator == "multi_measurement":
+        left = detections.replace(active=new)
+        tracks, num_dropped = _initiate_confirmed(surviving, left, time_step, index, static, params)
+    else:
+        tracks, num_dropped = _initiate(surviving, detections, new, index, params)
     return tracks, TrackerInfo(
         predicted=predicted,
         expected=expected,
@@ -89,20 +89,81 @@ _Update = tuple[kalman.ExpectedDetections, jax.Array, jax.Array, Tracks]
 """Expectations, distances `[T, D]`, associations `[T]`, and the updated track list."""
 
 
+def _follow(predicted: Tracks, detections: Detections, static: StaticParams, params: Params) -> _Update:
+    """Gate, associate, update."""
+    return jax.lax.cond(
+        jnp.any(detections.active),
+        lambda: _associate_and_update(predicted, detections, static, params),
+        lambda: _coast(predicted, detections, static, params),
+    )
+
+
 def _associate_and_update(
-    predicted: Tracks, detections: Detections, params: Params, measure: Measure
+    predicted: Tracks, detections: Detections, static: StaticParams, params: Params
 ) -> _Update:
-    expected = kalman.predict_detections(predicted, params)
-    distances = measure(expected, detections, params)
+    expected = FILTERS[static.filter](predicted, params)
+    distances = _distances(expected, detections, static, params)
     admissible = association.gate(distances, predicted, detections, params)
-    associated = association.associate_nearest_neighbour(admissible)
-    return expected, distances, associated, kalman.update(predicted, expected, detections, associated)
+    associated = ASSOCIATORS[static.associator](admissible, params)
+    if static.filter == "converted":
+        positions = converted.convert(detections, params)
+        updated = converted.update(predicted, expected, positions, associated)
+    else:
+        updated = kalman.update(predicted, expected, detections, associated)
+    return expected, distances, associated, updated
 
 
-def _coast(predicted: Tracks, detections: Detections, params: Params, measure: Measure) -> _Update:
+def _coast(predicted: Tracks, detections: Detections, static: StaticParams, params: Params) -> _Update:
     """`_associate_and_update` without a detection; costs nothing where no one asks for its details."""
-    expected = kalman.predict_detections(predicted, params)
-    return expected, measure(expected, detections, params), predicted.updated_by, predicted
+    expected = FILTERS[static.filter](predicted, params)
+    return expected, _distances(expected, detections, static, params), predicted.updated_by, predicted
+
+
+def _distances(
+    expected: ExpectedDetections, detections: Detections, static: StaticParams, params: Params
+) -> jax.Array:
+    measure = MEASURES[static.measure]
+    if static.filter == "converted":
+        return converted.distances(expected, converted.convert(detections, params), measure, params)
+    return measure(expected, detections, params)
+
+
+def _initiate(
+    tracks: Tracks, detections: Detections, new: jax.Array, index: jax.Array, params: Params
+) -> tuple[Tracks, jax.Array]:
+    """`lifecycle.initiate_tracks` where there is anything to initiate."""
+    return jax.lax.cond(
+        jnp.any(new),
+        lambda: lifecycle.initiate_tracks(tracks, detections, new, index, params),
+        lambda: (tracks, jnp.asarray(0)),
+    )
+
+
+def _initiate_confirmed(
+    tracks: Tracks,
+    detections: Detections,
+    time_step: Scalar,
+    index: jax.Array,
+    static: StaticParams,
+    params: Params,
+) -> tuple[Tracks, jax.Array]:
+    """Follows the tentative tracks, and takes over those with enough detections.
+
+    Stone Soup's `MultiMeasurementInitiator`. They have a tracker of their own, of the same parts, which
+    gets the `detections` that no track used. A tentative track is not looked at on the step of its birth,
+    so that `min_points` = 1 means: on the step after it.
+    """
+    if tracks.tentative is None:
+        raise ValueError("tracks.tentative = None: expected a list that began as lifecycle.no_tracks(...)")
+    tentative, detections = _blank_empty_rows(tracks.tentative, detections, params)
+    predicted = kalman.predict(tentative, time_step, params)
+    _, _, associated, updated = _follow(predicted, detections, static, params)
+    confirmed = updated.active & (lifecycle.counts_of(updated).hits >= static.min_points)
+    tracks, num_dropped = lifecycle.take_over(tracks, updated, confirmed)
+    held = lifecycle.delete_tracks(updated.replace(active=updated.active & ~confirmed), static, params)
+    new = lifecycle.unassociated(detections, associated)
+    held, num_dropped_held = _initiate(held, detections, new, index, params)
+    return tracks.replace(tentative=held), num_dropped + num_dropped_held
 
 
 def _blank_empty_rows(tracks: Tracks, detections: Detections, params: Params) -> tuple[Tracks, Detections]:

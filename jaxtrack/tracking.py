@@ -10,6 +10,7 @@ No track and no detection is ever left out: capacities follow what is recorded.
 import dataclasses
 import time
 from collections.abc import Generator
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -18,7 +19,9 @@ from flax import struct
 
 from jaxtrack import tracker
 from jaxtrack.detection_file import MICROSECONDS, RecordedDetections
-from jaxtrack.params import Params
+from jaxtrack.lifecycle import no_tracks
+from jaxtrack.params import Params, StaticParams
+from jaxtrack.tracker import DEFAULT
 from jaxtrack.types import STATE_DIM, Detections, Tracks
 
 CHUNK = 256
@@ -68,7 +71,7 @@ class Numbered(struct.PyTreeNode):
     So the order of the slots, which decides exact ties, depends on no capacity.
 
     Attributes:
-        tracks: capacity T.
+        tracks: capacity T; tentative ones first in their list too.
         number: `[T]` number of each live track, else `NO_TRACK`.
         born: tracks born so far, the number of the next one.
     """
@@ -95,7 +98,7 @@ class Scans(struct.PyTreeNode):
 
 
 def track_scans(
-    recorded: RecordedDetections, params: Params, chunk: int = CHUNK
+    recorded: RecordedDetections, params: Params, chunk: int = CHUNK, static: StaticParams = DEFAULT
 ) -> Generator[TrackRows, None, None]:
     """Runs the tracker over recorded detections; computes ahead of what was taken.
 
@@ -106,6 +109,7 @@ def track_scans(
         recorded: the detections of S scans; intervals may be uneven.
         params: numbers of the tracker; `time_step` is not used.
         chunk: scans in one call, so also in what is yielded; fewer where tracks are many.
+        static: the parts that the tracker is made of; shapes are not read.
 
     Yields:
         Live tracks of the next scans, until all S are done.
@@ -113,29 +117,29 @@ def track_scans(
     Raises:
         ValueError: if the pairs of detections and tracks of a scan need more than `MEMORY_LIMIT`.
     """
-    state, done, rows, compile_seconds = _empty(SMALLEST), 0, None, 0.0
+    state, done, rows, compile_seconds = _empty(SMALLEST, static), 0, None, 0.0
     after = state
     try:
         while done < len(recorded.time):
             batch = _batch(recorded, done, chunk, state)
-            state = _resized(state, max(_slots(state), batch.active.shape[1]))
+            state = _resized(state, max(_slots(state), batch.active.shape[1]), static)
             _check_memory(recorded, batch, state)
             began = time.perf_counter()
-            _run.lower(state, batch, params).compile()
+            _run.lower(state, batch, params, static).compile()
             compile_seconds += time.perf_counter() - began
-            after, made = _run(state, batch, params)
+            after, made = _run(state, batch, params, static)
             if rows is not None:
                 yield rows
                 rows = None
             shortage = np.asarray(made.num_dropped)
             if shortage.any():
                 # Again from the same state, as if the slots had been there from the start.
-                state = _resized(state, _slots(state) + shortage[shortage > 0][0])
+                state = _resized(state, _slots(state) + shortage[shortage > 0][0], static)
                 continue
             stop = min(done + len(batch.index), len(recorded.time))
             rows = _rows(made, range(done, stop), int(after.born), compile_seconds)
             _check_finite(rows, recorded)
-            state, done = _resized(after, np.asarray(made.active).sum(axis=1).max()), stop
+            state, done = _resized(after, _most_live(made), static), stop
         if rows is not None:
             yield rows
     finally:
@@ -148,6 +152,7 @@ class Made(struct.PyTreeNode):
 
     Attributes:
         num_dropped: `[K]` new tracks for which no slot was free.
+        num_tentative: `[K]` tentative tracks, or None where there are none.
     """
 
     mean: jax.Array
@@ -156,33 +161,53 @@ class Made(struct.PyTreeNode):
     updated_by: jax.Array
     number: jax.Array
     num_dropped: jax.Array
+    num_tentative: jax.Array | None
 
 
-@jax.jit
-def _run(state: Numbered, scans: Scans, params: Params) -> tuple[Numbered, Made]:
-    return jax.lax.scan(lambda state, scan: _step(state, scan, params), state, scans)
+@partial(jax.jit, static_argnames="static")
+def _run(state: Numbered, scans: Scans, params: Params, static: StaticParams) -> tuple[Numbered, Made]:
+    return jax.lax.scan(lambda state, scan: _step(state, scan, params, static), state, scans)
 
 
-def _step(state: Numbered, scan: Scans, params: Params) -> tuple[Numbered, Made]:
+def _step(state: Numbered, scan: Scans, params: Params, static: StaticParams) -> tuple[Numbered, Made]:
     """One scan; new tracks get their numbers, and the slots are put in order of birth."""
     detections = Detections.from_values(scan.value, scan.active)
-    tracks, info = tracker.step(state.tracks, detections, scan.time_step, scan.index, params)
+    tracks, info = tracker.step(state.tracks, detections, scan.time_step, scan.index, params, static)
     number = jnp.where(info.initiated, state.born + jnp.cumsum(info.initiated) - 1, state.number)
     order = jnp.argsort(jnp.where(tracks.active, number, jnp.iinfo(number.dtype).max))
+    tracks, tentative = tracks.replace(tentative=None), tracks.tentative
     tracks, number = jax.tree.map(lambda leaf: leaf[order], (tracks, number))
-    made = Made(tracks.mean, tracks.covariance, tracks.active, tracks.updated_by, number, info.num_dropped)
+    num_tentative = None
+    if tentative is not None:
+        num_tentative, order = jnp.sum(tentative.active), jnp.argsort(~tentative.active)
+        tracks = tracks.replace(tentative=jax.tree.map(lambda leaf: leaf[order], tentative))
+    made = Made(
+        tracks.mean,
+        tracks.covariance,
+        tracks.active,
+        tracks.updated_by,
+        number,
+        info.num_dropped,
+        num_tentative,
+    )
     return Numbered(tracks, number, state.born + jnp.sum(info.initiated)), made
 
 
-def _empty(slots: int) -> Numbered:
-    return Numbered(Tracks.empty(slots), jnp.full(slots, NO_TRACK, dtype=int), jnp.zeros((), dtype=int))
+def _most_live(made: Made) -> int:
+    """Slots that the fullest track list of a call needs, the tentative one included."""
+    live = np.asarray(made.active).sum(axis=1).max()
+    return int(live if made.num_tentative is None else max(live, np.asarray(made.num_tentative).max()))
+
+
+def _empty(slots: int, static: StaticParams) -> Numbered:
+    return Numbered(no_tracks(slots, static), jnp.full(slots, NO_TRACK, dtype=int), jnp.zeros((), dtype=int))
 
 
 def _slots(state: Numbered) -> int:
     return state.number.shape[0]
 
 
-def _resized(state: Numbered, slots: int) -> Numbered:
+def _resized(state: Numbered, slots: int, static: StaticParams) -> Numbered:
     """The same live tracks in the next power of two of slots, at least `SMALLEST`."""
     slots = _capacity(slots)
     if slots == _slots(state):
@@ -193,7 +218,7 @@ def _resized(state: Numbered, slots: int) -> Numbered:
         rows = np.asarray(leaf)
         return np.concatenate([rows[:slots], empty[len(rows) :]]) if rows.ndim else rows
 
-    return jax.tree.map(resize, state, jax.device_get(_empty(slots)))
+    return jax.tree.map(resize, state, jax.device_get(_empty(slots, static)))
 
 
 def _capacity(number: int) -> int:

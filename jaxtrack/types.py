@@ -12,6 +12,8 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
+from jaxtrack.counts import Counts
+
 Scalar = jax.Array | float
 """One number, traced or not."""
 
@@ -85,6 +87,8 @@ class Tracks(struct.PyTreeNode):
         birth_step: `[T]` step on which the track was initiated.
         birth_detection: `[T]` index, on that step, of the detection that initiated it.
         age: `[T]` steps since birth; 0 on the birth step.
+        counts: detections so far and time without one; only where a deleter or the initiator asks.
+        tentative: the tentative tracks of the initiator `multi_measurement`, also T; else None.
     """
 
     mean: jax.Array  # [T, 6]
@@ -94,10 +98,12 @@ class Tracks(struct.PyTreeNode):
     birth_step: jax.Array  # [T] int
     birth_detection: jax.Array  # [T] int
     age: jax.Array  # [T] int
+    counts: Counts | None = None
+    tentative: "Tracks | None" = None
 
     @classmethod
     def empty(cls, max_tracks: int) -> "Tracks":
-        """A track list without tracks."""
+        """A track list without tracks, for the default tracker; for any other `lifecycle.no_tracks`."""
         return cls(
             mean=jnp.zeros((max_tracks, STATE_DIM)),
             covariance=jnp.zeros((max_tracks, STATE_DIM, STATE_DIM)),

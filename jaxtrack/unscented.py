@@ -1,7 +1,7 @@
-"""The unscented transform of track states into detections.
+"""The unscented transform of track states into detections, and the cubature transform.
 
-Counterpart in Stone Soup: the measurement prediction of `UnscentedKalmanUpdater` with its typed
-angles (circular means, wrapped bearings, folded elevations).
+Counterparts in Stone Soup: the measurement predictions of `UnscentedKalmanUpdater` and
+`CubatureKalmanUpdater` with their typed angles (circular means, wrapped bearings, folded elevations).
 
 All detections are taken relative to the centre point's. With weights that sum to 1 its large
 negative weight then cancels exactly instead of in rounding, which is what makes float32
@@ -12,6 +12,7 @@ Tracks come last in every array, and what belongs to a sigma point of a track is
 `[12 T]`, point by point: a CPU works on many numbers at once only along long rows.
 """
 
+import dataclasses
 from typing import NamedTuple
 
 import jax
@@ -52,6 +53,32 @@ def unscented_transform(
     differences = _differences(relative, shift)
     S, C = _covariances(offsets, differences, shift, params)
     return expected, S, C
+
+
+def cubature_transform(
+    mean: jax.Array, covariance: jax.Array, params: Params
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """`unscented_transform` with the 12 cubature points, all of one weight, and none at the centre.
+
+    Stone Soup subtracts products of means from means of products. As angles have circular means,
+    their differences from these do not quite add up to zero, and what they leave in S and in the
+    covariance with the state is kept here in float64; in float32 it is less than rounding. Stone Soup
+    does not wrap the products, though, which spoils S where the points lie on both sides of the seam of
+    bearings at pi; here differences are wrapped.
+
+    I. Arasaratnam, S. Haykin, "Cubature Kalman filters", IEEE Transactions on Automatic Control 54 (2009).
+    """
+    params = dataclasses.replace(params, alpha=1.0, beta=0.0, kappa=0.0)
+    offsets = sigma_offsets(covariance, params)
+    relative = _relative_detections(mean, offsets)
+    expected, shift = _mean_detection(mean, relative, params)
+    differences = _differences(relative, shift)
+    S, C = _covariances(offsets, differences, shift, params)
+    if mean.dtype == jnp.float32:
+        return expected, S, C
+    left = jnp.stack([*(_sum_points(angle) / POINTS for angle in differences[:2]), jnp.zeros_like(mean[0])])
+    of_means = expected[:, None] * left
+    return expected, S + of_means + jnp.swapaxes(of_means, 0, 1), C + mean[:, None] * left
 
 
 def unscented_weights(params: Params) -> tuple[jax.Array, jax.Array]:

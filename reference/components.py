@@ -1,15 +1,22 @@
 """Stone Soup's components, built from the parameters of jaxtrack."""
 
 import datetime
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from stonesoup.dataassociator.neighbour import NearestNeighbour
+from stonesoup.dataassociator import DataAssociator
+from stonesoup.dataassociator.neighbour import GNNWith2DAssignment, NearestNeighbour
+from stonesoup.deleter import Deleter
 from stonesoup.deleter.error import CovarianceBasedDeleter
+from stonesoup.deleter.multi import CompositeDeleter
+from stonesoup.deleter.time import UpdateTimeDeleter, UpdateTimeStepsDeleter
+from stonesoup.functions import gauss2cubature
 from stonesoup.gater.distance import DistanceGater
 from stonesoup.hypothesiser.distance import DistanceHypothesiser
-from stonesoup.initiator.simple import SimpleMeasurementInitiator
+from stonesoup.initiator import Initiator
+from stonesoup.initiator.simple import MultiMeasurementInitiator, SimpleMeasurementInitiator
 from stonesoup.measures import Euclidean, Mahalanobis
 from stonesoup.measures.state import (
     GaussianHellinger,
@@ -19,14 +26,24 @@ from stonesoup.measures.state import (
     SquaredMahalanobis,
 )
 from stonesoup.metricgenerator.ospametric import GOSPAMetric
+from stonesoup.models.measurement.linear import LinearGaussian
 from stonesoup.models.measurement.nonlinear import CartesianToElevationBearingRange
 from stonesoup.models.transition.linear import CombinedLinearGaussianTransitionModel, ConstantVelocity
 from stonesoup.predictor.kalman import KalmanPredictor
 from stonesoup.tracker.simple import MultiTargetTracker
+from stonesoup.types.angle import Bearing, Elevation
+from stonesoup.types.array import StateVector
+from stonesoup.types.detection import Detection
+from stonesoup.types.prediction import MeasurementPrediction
 from stonesoup.types.state import GaussianState, State
-from stonesoup.updater.kalman import UnscentedKalmanUpdater
+from stonesoup.updater.kalman import (
+    CubatureKalmanUpdater,
+    ExtendedKalmanUpdater,
+    KalmanUpdater,
+    UnscentedKalmanUpdater,
+)
 
-from jaxtrack.params import Params
+from jaxtrack.params import Params, StaticParams
 from jaxtrack.types import POSITION, STATE_DIM, VELOCITY
 
 EPOCH = datetime.datetime(2000, 1, 1)
@@ -46,11 +63,52 @@ The last three need detections that carry their own covariance (`GaussianDetecti
 plain `Detection` they fail for want of one.
 """
 
+UPDATERS: dict[str, Callable[[Params], KalmanUpdater]] = {
+    "unscented": lambda params: UnscentedKalmanUpdater(
+        measurement_model=None, alpha=params.alpha, beta=params.beta, kappa=params.kappa
+    ),
+    "extended": lambda _: ExtendedKalmanUpdater(measurement_model=None),
+    "cubature": lambda _: SharpCubatureKalmanUpdater(measurement_model=None),
+    "converted": lambda _: KalmanUpdater(measurement_model=None),
+}
+"""Stock updaters by the names of `jaxtrack.kalman.FILTERS`.
+
+The last one needs detections that were converted to positions: `translate.to_positions`.
+"""
+
+ASSOCIATORS: dict[str, type[DataAssociator]] = {
+    "nearest_neighbour": NearestNeighbour,
+    "global_nearest_neighbour": GNNWith2DAssignment,
+}
+"""Stock associators by the names of `jaxtrack.association.ASSOCIATORS`."""
+
+
+def update_time_deleter(params: Params) -> UpdateTimeDeleter:
+    """Deletes tracks whose last detection is long ago."""
+    assert params.deletion_time is not None
+    return UpdateTimeDeleter(time_since_update=datetime.timedelta(seconds=float(params.deletion_time)))
+
+
+def update_time_steps_deleter(params: Params) -> UpdateTimeStepsDeleter:
+    """Deletes tracks that were missed many steps in a row."""
+    assert params.deletion_steps is not None
+    return UpdateTimeStepsDeleter(time_steps_since_update=int(params.deletion_steps))
+
+
+DELETERS: dict[str, Callable[[Params], Deleter]] = {
+    "covariance": lambda params: CovarianceBasedDeleter(covar_trace_thresh=params.deletion_threshold),
+    "update_time": update_time_deleter,
+    "update_time_steps": update_time_steps_deleter,
+}
+"""Stock deleters by the names of `jaxtrack.lifecycle.DELETERS`."""
+
+DEFAULT = StaticParams()
+
 
 class ExactCartesianToElevationBearingRange(CartesianToElevationBearingRange):
     """The stock model, but for its Jacobian: exact instead of finite differences.
 
-    Stone Soup's `SimpleMeasurementInitiator` is the only component that asks for it.
+    Stone Soup's `SimpleMeasurementInitiator` and `ExtendedKalmanUpdater` ask for it.
     """
 
     def jacobian(self, state: State, **kwargs: Any) -> np.ndarray:
@@ -71,18 +129,52 @@ class ExactCartesianToElevationBearingRange(CartesianToElevationBearingRange):
         return jacobian
 
 
+class SharpCubatureKalmanUpdater(CubatureKalmanUpdater):
+    """The stock updater, but for its rounding: the same formulas in extended precision, radar at the origin.
+
+    It forms products of coordinates, as large as the square of a range, and what is left of their
+    difference is as small as a variance.
+    """
+
+    def predict_measurement(
+        self,
+        predicted_state: GaussianState,
+        measurement_model: CartesianToElevationBearingRange | None = None,
+        measurement_noise: bool = True,
+        **kwargs: Any,
+    ) -> MeasurementPrediction:
+        """As `functions.cubature_transform`."""
+        model = self._check_measurement_model(measurement_model)
+        points = np.asarray(gauss2cubature(predicted_state), np.longdouble)
+        x, y, z = points[list(POSITION)]
+        r = np.sqrt(x**2 + y**2 + z**2)
+        seen = np.stack([np.arcsin(z / r), np.arctan2(y, x), r])
+        mean = np.stack([*np.arctan2(np.sin(seen[:2]).mean(axis=1), np.cos(seen[:2]).mean(axis=1)), r.mean()])
+        covariance = seen @ seen.T / r.size - np.outer(mean, mean)
+        cross = points @ seen.T / r.size - np.outer(points.mean(axis=1), mean)
+        if measurement_noise:
+            covariance += model.covar()
+        elevation, bearing, distance = map(float, mean)
+        return MeasurementPrediction.from_state(
+            predicted_state,
+            StateVector([Elevation(elevation), Bearing(bearing), distance]),
+            covariance.astype(float),
+            cross_covar=cross.astype(float),
+        )
+
+
 @dataclass(frozen=True)
 class Components:
     """The parts of one tracker, each a stock Stone Soup object."""
 
     measurement_model: CartesianToElevationBearingRange
     predictor: KalmanPredictor
-    updater: UnscentedKalmanUpdater
+    updater: KalmanUpdater
     measure: Measure
     hypothesiser: DistanceGater
-    associator: NearestNeighbour
-    initiator: SimpleMeasurementInitiator
-    deleter: CovarianceBasedDeleter
+    associator: DataAssociator
+    initiator: Initiator
+    deleter: Deleter
 
     def tracker(self) -> MultiTargetTracker:
         """The stock tracker; drive it with `update_tracker`."""
@@ -95,36 +187,66 @@ class Components:
         )
 
 
-def build_components(params: Params, exact_jacobian: bool = True, measure: str = "mahalanobis") -> Components:
+def build_components(
+    params: Params, exact_jacobian: bool = True, static: StaticParams = DEFAULT
+) -> Components:
     """Builds every component.
 
     Args:
         params: numbers of the tracker.
-        exact_jacobian: whether initiation uses the exact Jacobian, or the stock finite
-            differences, whose covariance is only good to about 1e-4.
-        measure: name of the distance of hypothesiser and gater.
+        exact_jacobian: whether initiation and the extended filter use the exact Jacobian, or the
+            stock finite differences, whose covariance is only good to about 1e-4.
+        static: which components, by name.
     """
     model = measurement_model(params, exact_jacobian)
     predictor = KalmanPredictor(transition_model(params.process_noise))
-    updater = UnscentedKalmanUpdater(
-        measurement_model=None, alpha=params.alpha, beta=params.beta, kappa=params.kappa
-    )
-    distance = MEASURES[measure]()
+    updater = UPDATERS[static.filter](params)
+    distance = MEASURES[static.measure]()
     hypothesiser = DistanceGater(
         DistanceHypothesiser(predictor, updater, distance, missed_distance=params.missed_distance),
         distance,
         params.gate_threshold,
     )
+    associator = ASSOCIATORS[static.associator](hypothesiser)
+    deleter = build_deleter(params, static)
+    initiator: Initiator = SimpleMeasurementInitiator(prior_state(params), model)
+    if static.initiator == "multi_measurement":
+        initiator = MultiMeasurementInitiator(
+            prior_state(params),
+            deleter=deleter,
+            data_associator=associator,
+            updater=updater,
+            measurement_model=model,
+            min_points=static.min_points,
+        )
     return Components(
         measurement_model=model,
         predictor=predictor,
         updater=updater,
         measure=distance,
         hypothesiser=hypothesiser,
-        associator=NearestNeighbour(hypothesiser),
-        initiator=SimpleMeasurementInitiator(prior_state(params), model),
-        deleter=CovarianceBasedDeleter(covar_trace_thresh=params.deletion_threshold),
+        associator=associator,
+        initiator=initiator,
+        deleter=deleter,
     )
+
+
+def build_deleter(params: Params, static: StaticParams) -> Deleter:
+    """The deleter of that name, or all of several in one."""
+    deleters = [DELETERS[name](params) for name in static.deleters]
+    return (
+        deleters[0]
+        if len(deleters) == 1
+        else CompositeDeleter(deleters=deleters, intersect=static.intersect_deleters)
+    )
+
+
+def position_model(detection: Detection) -> LinearGaussian:
+    """Model of a detection converted to a position: its noise is the detection's, to first order."""
+    model = detection.measurement_model
+    place = State(model.inverse_function(detection))
+    inverse = np.linalg.inv(model.jacobian(place)[:, list(POSITION)])
+    return LinearGaussian(STATE_DIM, POSITION, noise_covar=inverse @ model.covar() @ inverse.T)
 
 
 def transition_model(process_noise: float, seed: int | None = None) -> CombinedLinearGaussianTransitionModel:

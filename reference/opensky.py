@@ -221,7 +221,9 @@ def main(argv: Sequence[str]) -> int:
     interval = scan_interval(recording)
     write_detections(options.out / "detections.csv", detections, interval)
     numbers = tracker_params(options, interval)
-    write_json(options.out / "tracker.json", {name: getattr(numbers, name) for name in TRACKER_FIELDS})
+    values = {name: getattr(numbers, name) for name in TRACKER_FIELDS}
+    set_values = {name: value for name, value in values.items() if value is not None}
+    write_json(options.out / "tracker.json", set_values)
     figures = {"options": vars(options), "radar": vars(radar), "results": [r.as_dict() for r in results]}
     write_json(options.out / "opensky.json", figures)
     draw(recording, len(detections.value), results[0].run).savefig(options.out / "opensky.png")

@@ -8,14 +8,15 @@ from stonesoup.types.detection import Detection
 from stonesoup.types.track import Track
 from stonesoup.types.update import Update
 
-from jaxtrack.params import Params
+from jaxtrack.params import Params, StaticParams
 from jaxtrack.types import NO_DETECTION, Tracks
-from reference.components import build_components, time_of
+from reference.components import DEFAULT, build_components, time_of
 from reference.translate import (
     TrackKey,
     as_vector,
     detection_index,
     to_detections,
+    to_position,
     to_stone_soup_tracks,
     to_tracks,
     track_key,
@@ -88,12 +89,20 @@ class StoneSoupTracker:
         params: numbers of the tracker.
         exact_jacobian: see `build_components`.
         intermediates: whether the records hold predictions and distances, which the stock
-            tracker does not give away and which are computed a second time.
+            tracker does not give away and which are computed a second time. Not for the filter
+            `converted`, whose detections each have their own expectation.
+        static: which components, by name.
     """
 
-    def __init__(self, params: Params, exact_jacobian: bool = True, intermediates: bool = True) -> None:
-        self.params = params
-        self.components = build_components(params, exact_jacobian)
+    def __init__(
+        self,
+        params: Params,
+        exact_jacobian: bool = True,
+        intermediates: bool = True,
+        static: StaticParams = DEFAULT,
+    ) -> None:
+        self.params, self.static = params, static
+        self.components = build_components(params, exact_jacobian, static)
         self.intermediates = intermediates
         self.tracker = self.components.tracker()
         self.index = 0
@@ -128,6 +137,8 @@ class StoneSoupTracker:
         time = time_of(self.index, self.params) if time is None else time
         model = self.components.measurement_model
         detections = to_detections(np.asarray(value, float), active, self.index, time, model)
+        if self.static.filter == "converted":
+            detections = [to_position(detection) for detection in detections]
         before = {track_key(track): track for track in self.tracks}
         expected = {}
         if self.intermediates:

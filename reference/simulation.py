@@ -19,6 +19,7 @@ from reference.components import build_components, gospa_metric, time_of
 from reference.observation import ScanMap, TrackSlots, track_observation
 from reference.radar import build_radar, steer
 from reference.reward import snapshot, track_term
+from reference.translate import to_position
 from reference.truths import Draws, Script, initial_states, num_initial, scripted_simulator, truth_simulator
 
 Observation = dict[str, np.ndarray]
@@ -72,7 +73,7 @@ class StoneSoupScenario:
         self.row_of: dict[GroundTruthPath, int] = {}
         self._take_paths()
         self.radar = build_radar(self.params, seed=radar_seed)
-        self.components = build_components(self.params, self.exact_jacobian)
+        self.components = build_components(self.params, self.exact_jacobian, self.static)
         self.tracker = self.components.tracker()
         self.slots = TrackSlots(self.static.max_tracks)
         self.scan_map = ScanMap(self.static, self.params)
@@ -131,7 +132,7 @@ class StoneSoupScenario:
             if self.exact_jacobian:
                 # The initiator asks the detection's own model first.
                 detection.measurement_model = self.components.measurement_model
-        return found
+        return [to_position(one) for one in found] if self.static.filter == "converted" else found
 
     def observe(self) -> Observation:
         """Track features, mask and scan map, as `jaxtrack.observation` gives them."""

@@ -24,6 +24,7 @@ from stonesoup.types.track import Track
 from stonesoup.types.update import GaussianStateUpdate
 
 from jaxtrack.types import NEVER, NO_DETECTION, STATE_DIM, Tracks, Truths
+from reference.components import position_model
 
 TrackKey = tuple[int, int]
 """Birth step and birth detection of a track."""
@@ -54,6 +55,17 @@ def to_detections(
         )
         for row in np.flatnonzero(active)
     ]
+
+
+def to_position(detection: Detection) -> Detection:
+    """The same detection as a position (m), with a linear model and noise of its own."""
+    place = as_vector(detection.measurement_model.inverse_function(detection))[0::2]
+    return Detection(
+        StateVector(place),
+        timestamp=detection.timestamp,
+        measurement_model=position_model(detection),
+        metadata=detection.metadata,
+    )
 
 
 def detection_index(detection: Detection) -> int:

@@ -7,10 +7,18 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
+from scipy.optimize import linear_sum_assignment
 
 from jaxtrack import NO_DETECTION, Detections, Params
 from jaxtrack import params as params_module
-from jaxtrack.association import MEASURES, associate_nearest_neighbour, gate, mahalanobis
+from jaxtrack.association import (
+    ASSOCIATORS,
+    MEASURES,
+    associate_global_nearest_neighbour,
+    associate_nearest_neighbour,
+    gate,
+    mahalanobis,
+)
 from jaxtrack.kalman import ExpectedDetections
 from jaxtrack.models import wrap_detection
 
@@ -168,3 +176,53 @@ def test_the_choice_has_no_gradient():
 
     gradient = jax.grad(chosen_sum)(jnp.array([[1.0, 2.0], [3.0, INF]]))
     np.testing.assert_array_equal(gradient, [[1, 0], [0, 0]])
+
+
+assign_all = jax.jit(associate_global_nearest_neighbour)
+
+
+@pytest.mark.parametrize(
+    ("distances", "expected"),
+    [
+        pytest.param([[1, 2], [1.5, INF]], [1, 0], id="the first leaves it to the other"),
+        pytest.param([[1, 4.8], [1.5, INF]], [0, NO_DETECTION], id="a missed detection costs 5: 6 beats 6.3"),
+        pytest.param([[3, 1], [2, 0.5]], [1, 0], id="the sum of distances matters"),
+        pytest.param([[INF, INF], [INF, INF]], [NO_DETECTION] * 2, id="nothing admissible"),
+        pytest.param([[4.9], [4.8], [INF]], [NO_DETECTION, 0, NO_DETECTION], id="one detection"),
+        pytest.param([[3, 2, 1]], [2], id="one track"),
+    ],
+)
+def test_assignment_by_hand(distances, expected):
+    np.testing.assert_array_equal(assign_all(jnp.array(distances, dtype=float), 5.0), expected)
+
+
+def least_total(distances, missed):
+    """By scipy on the matrix of Stone Soup: a column of each track's own for its missed detection."""
+    count = len(distances)
+    own = np.where(np.eye(count, dtype=bool), missed, 1e9)
+    costs = np.concatenate([np.where(np.isfinite(distances), distances, 1e9), own], axis=1)
+    return costs[linear_sum_assignment(costs)].sum()
+
+
+@pytest.mark.parametrize("shape", [(6, 4), (4, 6)])
+def test_assignment_has_the_least_total_distance(shape):
+    rng = np.random.default_rng(0)
+    better = 0
+    for _ in range(200):
+        distances = 6 * rng.random(shape)
+        distances = np.where(distances < 4.0, distances, INF)
+
+        def total(associated, distances=distances):
+            used = associated[associated != NO_DETECTION]
+            assert len(set(used.tolist())) == len(used)
+            rows = np.flatnonzero(associated != NO_DETECTION)
+            return distances[rows, associated[rows]].sum() + 4.5 * (shape[0] - len(rows))
+
+        found = total(np.asarray(assign_all(jnp.asarray(distances), 4.5)))
+        np.testing.assert_allclose(found, least_total(distances, 4.5), rtol=1e-5)
+        better += found < total(np.asarray(associate(jnp.asarray(distances)))) - 1e-6
+    assert better > 50
+
+
+def test_every_associator_can_be_asked_for_by_name():
+    assert tuple(ASSOCIATORS) == params_module.ASSOCIATORS

@@ -5,8 +5,19 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxtrack import NO_DETECTION, Detections, Params, Tracks
-from jaxtrack.lifecycle import delete_uncertain_tracks, initial_estimate, initiate_tracks, unassociated
+from jaxtrack import NO_DETECTION, Detections, Params, StaticParams, Tracks
+from jaxtrack import params as params_module
+from jaxtrack.counts import Counts
+from jaxtrack.lifecycle import (
+    DELETERS,
+    delete_tracks,
+    delete_uncertain_tracks,
+    initial_estimate,
+    initiate_tracks,
+    no_tracks,
+    take_over,
+    unassociated,
+)
 from jaxtrack.models import inverse_elevation_bearing_range
 
 VALUES = np.array([[0.1, 0.2, 2000], [0.3, -0.4, 4000], [-0.5, 0.6, 6000]])
@@ -110,3 +121,70 @@ def test_a_track_begins_at_rest_in_the_world_whatever_the_platform_does():
     assert not np.signbit(at_rest[:, 1::2]).any()
     np.testing.assert_array_equal(mean[:, 0::2], at_rest[:, 0::2])
     np.testing.assert_array_equal(covariance, same)
+
+
+def counted(missed_steps, missed_time):
+    """Tracks of these counts, of which every other one is uncertain."""
+    count = len(missed_steps)
+    tracks = with_traces(*([1.0, 1e9] * count)[:count])
+    counts = Counts.zero(count).replace(
+        missed_steps=jnp.array(missed_steps), missed_time=jnp.array(missed_time)
+    )
+    return tracks.replace(counts=counts)
+
+
+@pytest.mark.parametrize(
+    ("deleters", "all_of_them", "kept"),
+    [
+        (("covariance",), False, [True, False, True, False]),
+        (("update_time_steps",), False, [True, True, False, False]),
+        (("update_time",), False, [True, True, True, False]),
+        (("covariance", "update_time_steps"), False, [True, False, False, False]),
+        (("covariance", "update_time_steps"), True, [True, True, True, False]),
+    ],
+)
+def test_deleters_by_hand(deleters, all_of_them, kept):
+    """Three steps without a detection are too many; half a second is not, a microsecond more is."""
+    tracks = counted([0, 2, 3, 4], [0, 400_000, 500_000, 500_001])
+    params = Params(deletion_time=0.5, deletion_steps=3)
+    static = StaticParams(deleters=deleters, intersect_deleters=all_of_them)
+    np.testing.assert_array_equal(delete_tracks(tracks, static, params).active, kept)
+
+
+def test_a_deleter_without_its_number_or_its_counts_is_an_error(params):
+    tracks = counted([0], [0])
+    with pytest.raises(ValueError, match=r"^deletion_time = None: expected"):
+        delete_tracks(tracks, StaticParams(deleters=("update_time",)), params)
+    static = StaticParams(deleters=("update_time_steps",))
+    with pytest.raises(ValueError, match=r"^deletion_steps = None: expected"):
+        delete_tracks(tracks, static, params)
+    with pytest.raises(ValueError, match=r"^tracks.counts = None: expected .* lifecycle.no_tracks"):
+        delete_tracks(Tracks.empty(2), static, params.replace(deletion_steps=3))
+
+
+def test_every_part_can_be_asked_for_by_name():
+    assert tuple(DELETERS) == params_module.DELETERS
+
+
+def test_a_list_keeps_only_what_its_parts_ask_for():
+    assert len(jax.tree.leaves(no_tracks(3, StaticParams()))) == len(jax.tree.leaves(Tracks.empty(3)))
+    by_time = no_tracks(3, StaticParams(deleters=("update_time",)))
+    assert by_time.counts is not None
+    assert by_time.tentative is None
+    several = no_tracks(3, StaticParams(initiator="multi_measurement"))
+    assert several.tentative.counts.hits.shape == (3,)
+    assert several.tentative.tentative is None
+
+
+def test_confirmed_tracks_take_the_first_free_slots_in_order(tracks_at):
+    static = StaticParams(initiator="multi_measurement")
+    held = tracks_at(np.arange(24.0).reshape(4, 6), 4, age=jnp.arange(4), counts=Counts.zero(4))
+    tracks = no_tracks(4, static).replace(active=jnp.array([True, False, True, False]))
+    for confirmed, taken, drops in (([0, 1, 0, 1], [1, 3], 0), ([1, 1, 1, 0], [0, 1], 1)):
+        confirmed = jnp.array(confirmed, dtype=bool)
+        after, dropped = jax.jit(take_over)(tracks, held, confirmed)
+        np.testing.assert_array_equal(after.active, [True] * 4)
+        np.testing.assert_array_equal(after.mean[jnp.array([1, 3])], held.mean[jnp.array(taken)])
+        np.testing.assert_array_equal(after.age[jnp.array([1, 3])], taken)
+        np.testing.assert_array_equal(after.mean[jnp.array([0, 2])], tracks.mean[jnp.array([0, 2])])
+        assert int(dropped) == drops

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from jaxtrack import Params, StaticParams, validate
-from jaxtrack.params import REWARDS, check_trajectories, looks_per_axis
+from jaxtrack.params import CONVERTED_MEASURES, MEASURES, REWARDS, check_trajectories, looks_per_axis
 
 QUANTITIES = [field for field in dataclasses.fields(Params) if "low" in field.metadata]
 
@@ -38,11 +38,49 @@ def test_looks_per_axis_is_not_rounded_up_by_the_last_bit():
         ("max_tracks", True),
         ("num_truths", "3"),
         ("reward", "unknown"),
+        ("filter", "particle"),
+        ("filter", None),
+        ("associator", "probabilistic"),
+        ("deleters", "covariance"),
+        ("deleters", ["covariance"]),
+        ("deleters", ()),
+        ("intersect_deleters", 1),
+        ("initiator", "two_point"),
+        ("min_points", 0),
     ],
 )
 def test_shapes_that_make_no_sense_are_refused_by_name(name, value):
     with pytest.raises(ValueError, match=rf"^{name} = {re.escape(repr(value))}: expected"):
         StaticParams(**{name: value})
+
+
+def test_the_message_names_the_choices():
+    with pytest.raises(ValueError, match=r"^deleters = 'age': expected one of covariance, update_time, "):
+        StaticParams(deleters=("covariance", "age"))
+    with pytest.raises(ValueError, match=r"^filter = 'x': expected one of unscented, extended, cubature, "):
+        StaticParams(filter="x")
+
+
+@pytest.mark.parametrize("measure", [name for name in MEASURES if name not in CONVERTED_MEASURES])
+def test_converted_detections_have_no_noise_of_one_size(measure):
+    message = rf"^measure = '{measure}': expected one of mahalanobis, .* with filter = 'converted'$"
+    with pytest.raises(ValueError, match=message):
+        StaticParams(filter="converted", measure=measure)
+
+
+@pytest.mark.parametrize(
+    ("deleter", "name", "good"),
+    [("update_time", "deletion_time", 0.5), ("update_time_steps", "deletion_steps", 3)],
+)
+def test_a_deleter_by_time_needs_its_number(deleter, name, good):
+    static = StaticParams(deleters=("covariance", deleter))
+    with pytest.raises(ValueError, match=rf"^{name} = None: expected a number for deleters = "):
+        validate(static, Params())
+    validate(static, Params(**{name: good}))
+    validate(StaticParams(), Params(**{name: good}))
+    for bad in (0, -1, True, "many", [good]):
+        with pytest.raises(ValueError, match=rf"^{name} = "):
+            validate(static, Params(**{name: bad}))
 
 
 def test_the_smallest_shapes_are_allowed():

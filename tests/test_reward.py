@@ -140,3 +140,22 @@ def test_gospa_is_worth_one_for_perfect_tracks_and_nothing_without_any():
 
 def test_every_name_of_a_reward_has_its_function():
     assert set(TRACK_TERMS) == set(REWARDS)
+
+
+@pytest.mark.parametrize("same_birth", [False, True])
+@pytest.mark.parametrize("was_active", [False, True])
+def test_a_track_that_enters_late_is_new_to_its_slot(same_birth, was_active):
+    """Some steps old, it takes the place of a track of the same look that was deleted just then."""
+    static = dataclasses.replace(STATIC, initiator="multi_measurement")
+    before = track_list([900], [0], active=[was_active]).replace(birth_step=jnp.array([3]))
+    after = track_list([80], [1]).replace(birth_step=jnp.array([3]))
+    before, after = (
+        each.replace(birth_detection=jnp.array([detection]))
+        for each, detection in ((before, 0), (after, 0 if same_birth else 1))
+    )
+    stayed = same_birth and was_active
+    fall = covariance_reduction(before, after, NOBODY, static, PARAMS)
+    assert float(fall) == pytest.approx(0.82 if stayed else 0.0)
+    deleted = was_active and not stayed
+    cost = shortfall(before, after, NOBODY, static, PARAMS)
+    assert float(cost) == pytest.approx(-(0.08 + 200.0 * deleted) / 4)

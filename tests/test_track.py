@@ -11,7 +11,7 @@ import jax
 import numpy as np
 import pytest
 
-from jaxtrack import NO_DETECTION, Params, track, tracking
+from jaxtrack import NO_DETECTION, Params, StaticParams, track, tracking
 from jaxtrack.cli import INTERRUPTED, run
 from jaxtrack.detection_file import read_detections
 from jaxtrack.track_file import HEADER, TrackWriter
@@ -52,7 +52,7 @@ def chunks(recorded):
 @pytest.fixture
 def one_call(monkeypatch, chunks):
     """Lets the command take the rows that were computed already."""
-    monkeypatch.setattr(track, "track_scans", lambda *_: (rows for rows in chunks))
+    monkeypatch.setattr(track, "track_scans", lambda *_, **__: (rows for rows in chunks))
 
 
 def test_the_file_holds_every_row_exactly(recorded, chunks, tmp_path, capsys):
@@ -105,8 +105,8 @@ def test_a_file_without_detections(tmp_path, capsys):
 def test_the_fields_are_exactly_those_that_the_tracker_uses(recorded):
     detections = read_detections(recorded)
 
-    def numbers(params):
-        chunks = list(tracking.track_scans(detections, params))
+    def numbers(params, **parts):
+        chunks = list(tracking.track_scans(detections, params, static=StaticParams(**parts)))
         return [
             np.concatenate([getattr(c, n).ravel() for c in chunks])
             for n in ("track", "covariance", "detection")
@@ -126,14 +126,22 @@ def test_the_fields_are_exactly_those_that_the_tracker_uses(recorded):
         "missed_distance": 1e-3,
         "platform_speed": 9.0,
     }
-    for name in track.TRACKER_FIELDS:
+    parts = {
+        "deletion_time": {"deleters": ("update_time",)},
+        "deletion_steps": {"deleters": ("update_time_steps",)},
+    }
+    for name, part in parts.items():
+        short = 1 if name == "deletion_steps" else 0.01
+        long, short = (numbers(plain.replace(**{name: value}), **part) for value in (100, short))
+        assert len(long[0]) > len(short[0])
+    for name in sorted(set(track.TRACKER_FIELDS) - parts.keys()):
         changed = plain.replace(**{name: changes.get(name, 1.1 * getattr(plain, name))})
         pairs = zip(numbers(changed), numbers(plain), strict=True)
         assert not all(np.array_equal(ours, theirs) for ours, theirs in pairs), name
 
 
 def test_ctrl_c_leaves_the_scans_done(recorded, chunks, tmp_path, monkeypatch, capsys):
-    def interrupted(*_):
+    def interrupted(*_, **__):
         yield from chunks
         raise KeyboardInterrupt
 

@@ -2,7 +2,7 @@
 
 import pytest
 
-from jaxtrack import Params, track
+from jaxtrack import Params, StaticParams, track
 from jaxtrack.cli import run
 
 
@@ -16,13 +16,56 @@ def recorded(tmp_path_factory):
 
 def test_numbers_come_from_the_file_and_the_command_line_wins(recorded, tmp_path, monkeypatch):
     seen = []
-    monkeypatch.setattr(track, "track_file", lambda recorded, params, options: seen.append(params))
+    monkeypatch.setattr(track, "track_file", lambda recorded, params, options, static: seen.append(params))
     for name, text in (("a.toml", "alpha = 1\nbeta = 3.5\n"), ("a.json", '{"alpha": 1, "beta": 3.5}')):
         (tmp_path / name).write_text(text)
         argv = [str(recorded), "--out", str(tmp_path / "out.csv"), "--config", str(tmp_path / name)]
         track.main([*argv, "--set", "alpha=0.7", "--set", "kappa = -2"])
     assert seen == [Params(alpha=0.7, beta=3.5, kappa=-2.0)] * 2
-    assert all(type(getattr(seen[0], name)) is float for name in track.TRACKER_FIELDS)
+    numbers = [getattr(seen[0], name) for name in track.TRACKER_FIELDS]
+    assert all(type(number) is float for number in numbers if number is not None)
+
+
+def test_parts_come_from_the_file_and_the_command_line_wins(recorded, tmp_path, monkeypatch):
+    seen = []
+    monkeypatch.setattr(track, "track_file", lambda *_: seen.append(_[1:]))
+    text = (
+        'filter = "extended"\ndeleters = ["covariance", "update_time"]\nmin_points = 4\ndeletion_time = 2\n'
+    )
+    (tmp_path / "a.toml").write_text(text)
+    argv = [str(recorded), "--out", str(tmp_path / "out.csv"), "--config", str(tmp_path / "a.toml")]
+    track.main([*argv, "--set", "filter=cubature", "--set", "initiator=multi_measurement"])
+    track.main(
+        [*argv, "--set", "deleters=update_time_steps", "--set", "deletion_steps=3", "--set", "min_points=2"]
+    )
+    track.main([*argv, "--set", "intersect_deleters=True"])
+    first, second, third = (static for _, _, static in seen)
+    parts = {"min_points": 4, "deleters": ("covariance", "update_time")}
+    assert first == StaticParams(filter="cubature", initiator="multi_measurement", **parts)
+    assert second == StaticParams(filter="extended", deleters=("update_time_steps",))
+    assert third == StaticParams(filter="extended", intersect_deleters=True, **parts)
+    assert seen[1][0].deletion_steps == 3
+
+
+@pytest.mark.parametrize(
+    ("values", "words"),
+    [
+        ({"filter": "particle"}, "filter = 'particle': expected one of unscented, extended"),
+        ({"deleters": "covariance,age"}, "deleters = 'age': expected one of covariance"),
+        ({"deleters": 3}, "deleters = 3: expected a tuple of names"),
+        ({"min_points": "two"}, "min_points = 'two': expected an integer in [1, 10000]"),
+        ({"intersect_deleters": "maybe"}, "intersect_deleters = 'maybe': expected True or False"),
+    ],
+)
+def test_wrong_parts_are_refused(values, words):
+    with pytest.raises(ValueError) as caught:  # noqa: PT011  # the message is compared
+        track.build_static(values)
+    assert words in str(caught.value)
+
+
+def test_a_deleter_without_its_number_is_refused(recorded, tmp_path):
+    with pytest.raises(ValueError, match="deletion_time = None: expected a number"):
+        track.main([str(recorded), "--out", str(tmp_path / "o.csv"), "--set", "deleters=update_time"])
 
 
 @pytest.mark.parametrize(
@@ -98,5 +141,6 @@ def test_help_lists_options_and_numbers(capsys):
     said = capsys.readouterr().out
     for words in ("--out PATH", "--config FILE", "--set", "--plot", "range_sigma = 5 m, in (0, 1e+09]"):
         assert words in said
-    for name in track.TRACKER_FIELDS:
+    for name in (*track.TRACKER_FIELDS, *track.TRACKER_CHOICES):
         assert f"{name} = " in said
+    assert "filter = unscented, of unscented, extended, cubature, converted" in said

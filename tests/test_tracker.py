@@ -1,11 +1,13 @@
 """One cycle of the tracker: order of the verbs, symmetries, masks, gradients, transformations."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxtrack import NO_DETECTION, Detections, Params, Tracks, tracker
+from jaxtrack import NO_DETECTION, Detections, Params, StaticParams, Tracks, lifecycle, tracker
 from jaxtrack.models import inverse_elevation_bearing_range
 from jaxtrack.types import NO_TRUTH
 
@@ -211,10 +213,10 @@ def test_a_step_returns_the_types_it_takes(params):
     # Otherwise a loop over steps compiles twice.
     tracks, detections = Tracks.empty(2), Detections.from_values(DETECTED[:1])
     after, _ = jax.eval_shape(tracker.step, tracks, detections, DT, STEP, params)
-    for name, leaf in vars(after).items():
-        before = getattr(tracks, name)
-        types = [(each.shape, each.dtype, each.weak_type) for each in (before, leaf)]
-        assert types[0] == types[1], name
+    types = [
+        jax.tree.map(lambda leaf: (leaf.shape, leaf.dtype, leaf.weak_type), each) for each in (tracks, after)
+    ]
+    assert types[0] == types[1]
 
 
 def test_compiled_equals_eager(tracks, detections, params):
@@ -248,3 +250,81 @@ def test_single_precision_agrees_with_double(single, x64, tracks, detections):
     assert double.mean.dtype == double.covariance.dtype == jnp.float64
     np.testing.assert_array_equal(single.updated_by, double.updated_by)
     np.testing.assert_allclose(single.mean[:3], double.mean[:3], rtol=1e-5, atol=0.05)
+
+
+SEVERAL = StaticParams(initiator="multi_measurement", min_points=3)
+follow = jax.jit(tracker.step, static_argnames="static")
+
+
+def play(scans, static, params=None, time_step=0.1):
+    """The track lists after scans, each a list of detections; all have room for two."""
+    params, tracks, lists = params or Params(), lifecycle.no_tracks(3, static), []
+    for index, scan in enumerate(scans):
+        value = np.array([*scan, *[[0.0, 0.0, 1000.0]] * (2 - len(scan))])
+        detections = Detections.from_values(value, np.arange(2) < len(scan))
+        tracks, info = follow(tracks, detections, time_step, index, params, static=static)
+        lists.append((tracks, info))
+    return lists
+
+
+HERE, THERE = [0.1, 0.2, 3000.0], [-0.3, 0.7, 5000.0]
+
+
+@pytest.mark.usefixtures("quick_compilation")
+def test_a_tentative_track_enters_with_its_third_detection():
+    """With a miss between; then it is the tracker's own, and its detections start no other."""
+    lists = play([[HERE], [], [HERE, THERE], [THERE, HERE], [HERE]], SEVERAL)
+    np.testing.assert_array_equal([int(t.active.sum()) for t, _ in lists], [0, 0, 0, 1, 1])
+    np.testing.assert_array_equal([int(t.tentative.active.sum()) for t, _ in lists], [1, 1, 2, 1, 1])
+    entered, info = lists[3]
+    assert info.initiated.tolist() == [True, False, False]
+    assert (entered.birth_step[0], entered.birth_detection[0]) == (0, 0)
+    assert (entered.age[0], entered.updated_by[0], entered.counts.hits[0]) == (3, 1, 3)
+    assert lists[4][1].associated.tolist() == [0, NO_DETECTION, NO_DETECTION]
+
+
+@pytest.mark.usefixtures("quick_compilation")
+def test_tentative_tracks_are_deleted_too():
+    static = dataclasses.replace(SEVERAL, deleters=("update_time_steps",))
+    lists = play([[HERE, THERE], [HERE], [HERE], [THERE]], static, Params(deletion_steps=2))
+    # The other is missed twice and gone; its next detection starts a new one.
+    np.testing.assert_array_equal(lists[-1][0].tentative.birth_step[lists[-1][0].tentative.active], [3])
+    np.testing.assert_array_equal([int(t.active.sum()) for t, _ in lists], [0, 0, 1, 1])
+
+
+PARTS = [
+    {"filter": "extended"},
+    {"filter": "cubature", "associator": "global_nearest_neighbour"},
+    {"filter": "converted", "deleters": ("update_time", "update_time_steps"), "intersect_deleters": True},
+    {"initiator": "multi_measurement", "min_points": 1},
+]
+
+
+@pytest.mark.usefixtures("quick_compilation")
+@pytest.mark.parametrize("parts", PARTS, ids=lambda parts: "-".join(map(str, parts.values())))
+def test_other_parts_keep_the_rules_of_a_step(parts, tracks, detections):
+    """Types are kept, NaN in empty rows changes no bit, an empty look is only a prediction."""
+    static, params = StaticParams(**parts), Params(deletion_time=1.0, deletion_steps=5)
+    start = lifecycle.no_tracks(5, static)
+    more = {"counts": start.counts, "tentative": start.tentative}
+    scenes = [
+        (tracks.replace(**more), detections),
+        (poison(tracks).replace(**more), poison(detections)),
+        (tracks.replace(**more), detections.replace(active=jnp.zeros(4, dtype=bool))),
+    ]
+    batch = jax.tree.map(lambda *leaves: jnp.stack(leaves), *scenes)
+    step_all = jax.jit(jax.vmap(lambda *scene: tracker.step(*scene, DT, STEP, params, static)))
+    after, info = jax.device_get(step_all(*batch))
+    kinds = [jax.tree.map(lambda leaf: (leaf.shape, leaf.dtype), each) for each in (batch[0], after)]
+    assert kinds[0] == kinds[1]
+    clean, poisoned, blind = (
+        jax.tree.map(lambda leaf, row=row: leaf[row], (after, info)) for row in range(3)
+    )
+    jax.tree.map(np.testing.assert_array_equal, poisoned, clean)
+    assert clean[1].associated.tolist()[:2] == [1, 0]
+    np.testing.assert_array_equal(blind[0].mean, blind[1].predicted.mean)
+
+
+def test_a_list_without_tentative_tracks_is_refused(detections, params):
+    with pytest.raises(ValueError, match=r"^tracks.tentative = None: expected"):
+        follow.trace(Tracks.empty(5), detections, DT, STEP, params, static=SEVERAL)

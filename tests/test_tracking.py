@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from jaxtrack import NO_DETECTION, Params, tracking
+from jaxtrack import NO_DETECTION, Params, StaticParams, tracking
 from jaxtrack.detection_file import RecordedDetections
 from jaxtrack.tracking import track_scans
 
@@ -57,8 +57,8 @@ def test_slots_grow_and_shrink_without_a_trace(recorded, large, monkeypatch):
     monkeypatch.setattr(tracking, "SMALLEST", 8)
     sizes, resized = [], tracking._resized
 
-    def watched(state, slots):
-        state = resized(state, slots)
+    def watched(state, slots, static):
+        state = resized(state, slots, static)
         sizes.append(state.number.shape[0])
         return state
 
@@ -149,3 +149,32 @@ def test_an_estimate_that_is_not_finite_is_named():
     recorded = RecordedDetections.from_scans([0.5], [[[0.1, 0.2, 3000.0], [0.1, 0.2, 1e200]]])
     with pytest.raises(ValueError, match=r"time 0\.5, track 1: its estimate is not finite"):
         list(track_scans(recorded, PARAMS, chunk=3))
+
+
+def test_slots_of_tentative_tracks_grow_and_shrink_without_a_trace(recorded, monkeypatch):
+    static = StaticParams(initiator="multi_measurement", deleters=("update_time_steps",))
+    params, tables, sizes, resized = PARAMS.replace(deletion_steps=3), [], set(), tracking._resized
+
+    def watched(state, slots, static):
+        state = resized(state, slots, static)
+        sizes.add(state.number.shape[0])
+        return state
+
+    for smallest, chunk in ((8, 3), (32, len(COUNTS))):
+        monkeypatch.setattr(tracking, "SMALLEST", smallest)
+        monkeypatch.setattr(tracking, "_resized", watched)
+        tables.append(table(track_scans(recorded, params, chunk, static)))
+    assert sizes >= {8, 16, 32}
+    assert_same(*tables)
+    assert len(tables[0]["scan"]) > 30
+
+
+def test_tentative_tracks_need_room_too(monkeypatch):
+    """Twelve tentative tracks and no other, kept from call to call; then all are seen again."""
+    monkeypatch.setattr(tracking, "SMALLEST", 8)
+    places = np.array([[0.1, 0.25 * k, 2000.0 + 300 * k] for k in range(12)])
+    recorded = RecordedDetections.from_scans(0.01 * np.arange(13), [*places[:, None], places])
+    rows = table(track_scans(recorded, PARAMS, 3, StaticParams(initiator="multi_measurement")))
+    assert rows["scan"].tolist() == [12] * 12
+    assert rows["track"].tolist() == rows["detection"].tolist() == list(range(12))
+    np.testing.assert_allclose(rows["mean"][:, 4], places[:, 2] * np.sin(0.1), atol=1.0)

@@ -20,6 +20,7 @@ from reference.parity.free_running import free_running_rows
 from reference.parity.metrics import COMPARISONS, metric_rows
 from reference.parity.models import NUM_MODELS, model_rows
 from reference.parity.oracle import Job, run_all
+from reference.parity.parts import part_rows
 from reference.parity.records import random_records
 from reference.parity.rows import Row
 from reference.parity.scenarios import random_scenario
@@ -44,6 +45,8 @@ class ParityOptions:
     """Random scenarios that are compared step by step, every intermediate."""
     steps: int = 50
     """Steps of each episode and scenario."""
+    part_episodes: int = 50
+    """Free-running random episodes with each of the parts beside the default ones."""
     samples: int = 2000
     """Random inputs of each model, measure and sensor."""
     records: int = 50
@@ -64,6 +67,7 @@ QUICK: dict[str, Any] = {
     "episodes": 12,
     "scenarios": 8,
     "steps": 40,
+    "part_episodes": 2,
     "samples": 60,
     "records": 3,
     "environments": 4,
@@ -99,6 +103,10 @@ def measure(options: ParityOptions, progress: Progress) -> tuple[list[Row], list
     seeds = range(last, last + options.episodes)
     episodes, divergences = free_running_rows(seeds, options.steps, processes, follow)
     rows += episodes
+
+    parts, lines = part_rows(options.seed, options.part_episodes, options.steps, processes, follow)
+    rows += parts
+    divergences += lines
 
     models = model_rows(options.seed, options.samples)
     rows += follow(models, NUM_MODELS, "models, measures, sensor")

@@ -5,6 +5,8 @@ from typing import Any
 
 import numpy as np
 
+from jaxtrack.params import StaticParams
+from reference.components import DEFAULT
 from reference.parity.compare import TOLERANCE
 from reference.parity.episodes import Comparison, EpisodeTallies, compare_episode
 from reference.parity.oracle import Job, run_all
@@ -50,10 +52,16 @@ def free_running_rows(
     ]
 
 
-def compare(scenario: Scenario, records: list[StepRecord], is_double: bool, tolerance: float) -> Comparison:
+def compare(
+    scenario: Scenario,
+    records: list[StepRecord],
+    is_double: bool,
+    tolerance: float,
+    static: StaticParams = DEFAULT,
+) -> Comparison:
     """Our episode, in one precision, beside Stone Soup's."""
     active = np.asarray(scenario.detections.active)
-    return compare_episode(records, *episode(scenario, is_double), active, scenario.params, tolerance)
+    return compare_episode(records, *episode(scenario, is_double, static), active, scenario.params, tolerance)
 
 
 def _rows(episodes: int, double: EpisodeTallies, single: EpisodeTallies, stock: EpisodeTallies) -> list[Row]:

@@ -15,7 +15,7 @@ from stonesoup.types.prediction import GaussianStatePrediction
 from stonesoup.types.state import State
 
 from jaxtrack import association, kalman, models, platform, sensor
-from jaxtrack.params import Params
+from jaxtrack.params import Params, StaticParams
 from jaxtrack.types import Detections
 from reference.components import (
     EPOCH,
@@ -201,7 +201,7 @@ def stock_distances(
     mean: np.ndarray, covariance: np.ndarray, value: np.ndarray, params: Params, name: str
 ) -> tuple[np.ndarray, kalman.ExpectedDetections]:
     """Distances `[T, 4]` by the stock hypothesiser, and the expected detections they are from."""
-    parts = build_components(params, measure=name)
+    parts = build_components(params, static=StaticParams(measure=name))
     model = parts.measurement_model
     R = noise_covariance(params)
     distances = np.empty(value.shape[:2])

@@ -8,23 +8,26 @@ from typing import Any
 
 import numpy as np
 
+from jaxtrack.params import StaticParams
 from jaxtrack.types import NO_DETECTION, STATE_DIM, Tracks
+from reference.components import DEFAULT
 from reference.parity.scenarios import Scenario
 from reference.pipeline import StepRecord, StoneSoupTracker
 
 
 @dataclass(frozen=True)
 class Job:
-    """What a process is asked to do; see `StoneSoupTracker` for the last two."""
+    """What a process is asked to do; see `StoneSoupTracker` for all but the first."""
 
     scenario: Scenario
     exact_jacobian: bool = True
     intermediates: bool = False
+    static: StaticParams = DEFAULT
 
 
 def run(job: Job) -> list[StepRecord]:
     """One free-running episode of the stock tracker."""
-    oracle = StoneSoupTracker(job.scenario.params, job.exact_jacobian, job.intermediates)
+    oracle = StoneSoupTracker(job.scenario.params, job.exact_jacobian, job.intermediates, job.static)
     detections = job.scenario.detections
     return [
         oracle.step(value, active) for value, active in zip(detections.value, detections.active, strict=True)

@@ -8,9 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxtrack import tracker
-from jaxtrack.params import Params
+from jaxtrack.lifecycle import no_tracks
+from jaxtrack.params import Params, StaticParams
 from jaxtrack.tracker import TrackerInfo
 from jaxtrack.types import Detections, Tracks
+from reference.components import DEFAULT
 from reference.parity.scenarios import Scenario
 
 MAX_TRACKS = 64
@@ -31,9 +33,11 @@ def steps_from(before: Tracks, scenario: Scenario, double: bool = True) -> tuple
     return on_device(_steps_from, double, before, scenario.detections, index, scenario.params)
 
 
-def episode(scenario: Scenario, double: bool = True) -> tuple[Tracks, TrackerInfo]:
+def episode(
+    scenario: Scenario, double: bool = True, static: StaticParams = DEFAULT
+) -> tuple[Tracks, TrackerInfo]:
     """The whole scenario from an empty track list; `[K]` results on the host."""
-    play = partial(track_detections, max_tracks=MAX_TRACKS)
+    play = partial(track_detections, max_tracks=MAX_TRACKS, static=static)
     return on_device(play, double, scenario.detections, scenario.params)
 
 
@@ -64,14 +68,16 @@ def _steps_from(
     return jax.vmap(one)(before, detections, index)
 
 
-@partial(jax.jit, static_argnames="max_tracks")
-def track_detections(detections: Detections, params: Params, max_tracks: int) -> tuple[Tracks, TrackerInfo]:
+@partial(jax.jit, static_argnames=("max_tracks", "static"))
+def track_detections(
+    detections: Detections, params: Params, max_tracks: int, static: StaticParams = DEFAULT
+) -> tuple[Tracks, TrackerInfo]:
     """The tracker on detections `[K, D]` from an empty list of `max_tracks` slots; results `[K]`."""
 
     def one(carry: tuple[Tracks, jax.Array], scan: Detections) -> tuple[Any, Any]:
         tracks, index = carry
-        tracks, info = tracker.step(tracks, scan, params.time_step, index, params)
+        tracks, info = tracker.step(tracks, scan, params.time_step, index, params, static)
         return (tracks, index + 1), (tracks, info)
 
-    start = Tracks.empty(max_tracks), jnp.asarray(1)
+    start = no_tracks(max_tracks, static), jnp.asarray(1)
     return jax.lax.scan(one, start, detections)[1]

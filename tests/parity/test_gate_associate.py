@@ -7,7 +7,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from stonesoup.dataassociator.neighbour import NearestNeighbour
+from stonesoup.dataassociator.neighbour import (
+    GlobalNearestNeighbour,
+    GNNWith2DAssignment,
+    NearestNeighbour,
+)
 from stonesoup.types.detection import Detection, MissedDetection
 from stonesoup.types.hypothesis import SingleDistanceHypothesis
 from stonesoup.types.multihypothesis import MultipleHypothesis
@@ -18,6 +22,7 @@ from reference.pipeline import StoneSoupTracker
 
 GATE = jax.jit(association.gate)
 ASSOCIATE = jax.jit(association.associate_nearest_neighbour)
+ASSIGN = jax.jit(association.associate_global_nearest_neighbour)
 
 
 def expectations(tracks, value, params):
@@ -78,10 +83,10 @@ class FromMatrix:
         return MultipleHypothesis(sorted(hypotheses, reverse=True))
 
 
-def stone_soup_associations(distances, missed_distance):
+def stone_soup_associations(distances, missed_distance, kind=NearestNeighbour):
     detections = {Detection([0.0], metadata={"index": row}) for row in range(distances.shape[1])}
     hypothesiser = FromMatrix(distances, missed_distance)
-    found = NearestNeighbour(hypothesiser).associate(set(range(len(distances))), detections, None)
+    found = kind(hypothesiser).associate(set(range(len(distances))), detections, None)
     associated = np.full(len(distances), NO_DETECTION)
     for track, hypothesis in found.items():
         if hypothesis:
@@ -101,6 +106,30 @@ def test_greedy_association(shape):
         nearest = np.where(np.isfinite(admissible.min(axis=1)), admissible.argmin(axis=1), NO_DETECTION)
         differs_from_own_nearest += np.any(nearest != theirs)
     assert differs_from_own_nearest > 10 or shape == (1, 1)
+
+
+@pytest.mark.parametrize("missed_distance", [3.5, 5.0])
+@pytest.mark.parametrize(
+    ("shape", "kind"),
+    [
+        ((1, 1), GNNWith2DAssignment),
+        ((3, 10), GNNWith2DAssignment),
+        ((9, 4), GNNWith2DAssignment),
+        ((8, 8), GNNWith2DAssignment),
+        ((3, 4), GlobalNearestNeighbour),
+    ],
+)
+def test_optimal_association(shape, kind, missed_distance):
+    """What a missed detection costs decides how many there are."""
+    rng = np.random.default_rng(4)
+    differs_from_greedy = 0
+    for _ in range(40):
+        distances = 6.0 * rng.random(shape)
+        admissible = np.where(distances < missed_distance, distances, np.inf)
+        theirs = stone_soup_associations(distances, missed_distance, kind)
+        np.testing.assert_array_equal(ASSIGN(admissible, missed_distance), theirs)
+        differs_from_greedy += np.any(ASSOCIATE(admissible) != theirs)
+    assert differs_from_greedy >= 5 or shape == (1, 1)
 
 
 def test_loser_of_a_contested_detection_takes_its_next_best():

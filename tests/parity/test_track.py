@@ -13,6 +13,13 @@ from reference.parity.scenes import spherical, unit_vectors
 from reference.pipeline import StoneSoupTracker
 
 SETTINGS = {"process_noise": 20.0, "deletion_threshold": 4000.0, "gate_threshold": 4.0, "range_sigma": 8.0}
+OTHER_PARTS = {
+    "filter": "extended",
+    "associator": "global_nearest_neighbour",
+    "deleters": "update_time,covariance",
+    "deletion_time": 0.6,
+    "initiator": "multi_measurement",
+}
 START = 1_600_000_000.0
 SCANS = 60
 
@@ -65,13 +72,19 @@ def read_tracks(path):
     return scans
 
 
-def test_the_file_of_tracks_is_stone_soups(tmp_path, capsys):
+@pytest.mark.parametrize("parts", [{}, OTHER_PARTS], ids=["default", "other parts"])
+def test_the_file_of_tracks_is_stone_soups(parts, tmp_path, capsys):
     recorded, written = tmp_path / "detections.csv", tmp_path / "tracks.csv"
     write_recording(recorded)
-    settings = [word for name, value in SETTINGS.items() for word in ("--set", f"{name}={value}")]
+    settings = [
+        word for name, value in {**SETTINGS, **parts}.items() for word in ("--set", f"{name}={value}")
+    ]
     assert track.main([str(recorded), "--out", str(written), *settings]) == 0
     ours = read_tracks(written)
-    oracle = StoneSoupTracker(Params(**SETTINGS), intermediates=False)
+    chosen = {name: value for name, value in parts.items() if name in track.TRACKER_CHOICES}
+    numbers = {name: value for name, value in parts.items() if name not in chosen}
+    static = track.build_static(chosen)
+    oracle = StoneSoupTracker(Params(**SETTINGS, **numbers), intermediates=False, static=static)
     numbers, happened = {}, {"updates": 0, "deletions": 0, "missed": 0}
     for time, value in read_scans(recorded).items():
         moment = datetime.datetime(1970, 1, 1) + datetime.timedelta(seconds=float(time))
@@ -82,15 +95,16 @@ def test_the_file_of_tracks_is_stone_soups(tmp_path, capsys):
         assert [row[0] for row in rows] == [number for number, _ in expected], f"{time}: live tracks"
         for (_, mean, covariance, source), (number, key) in zip(rows, expected, strict=True):
             estimate = theirs.live[key]
-            assert source == theirs.source(key), f"{time}, track {number}: detection"
+            if not (parts and key in theirs.initiated):  # that of its birth is not the last of several
+                assert source == theirs.source(key), f"{time}, track {number}: detection"
             assert mean_error(mean, estimate.mean, estimate.covariance) <= TOLERANCE
             assert covariance_error(covariance, estimate.covariance) <= TOLERANCE
         happened["updates"] += len(theirs.associated)
         happened["deletions"] += len(theirs.deleted)
         happened["missed"] += sum(row[3] == NO_DETECTION for row in rows)
     assert not ours
-    assert happened["updates"] > 150
-    assert min(happened["deletions"], happened["missed"]) > 20
+    assert happened["updates"] > (100 if parts else 150)
+    assert min(happened["deletions"], happened["missed"]) > (5 if parts else 20)
     said = capsys.readouterr().out
     assert f"scans {SCANS}, " in said
     assert f"tracks {len(numbers)}; " in said

@@ -129,7 +129,14 @@ def test_the_folder_of_a_run_is_new(tmp_path):
     assert not (tmp_path / "new").exists()
 
 
-CHOICES = {"reward": "as_printed", "measure": "hellinger"}
+CHOICES = {
+    "reward": "as_printed",
+    "measure": "hellinger",
+    "filter": "extended",
+    "associator": "global_nearest_neighbour",
+    "deleters": ("covariance", "update_time"),
+    "initiator": "multi_measurement",
+}
 
 
 def changed(config):
@@ -176,7 +183,7 @@ def test_missing_fields_keep_their_defaults():
     ("values", "message"),
     [
         ({"nonsense": 1}, "nonsense: no such field; expected one of anneal, "),
-        ({"static": {"nonsense": 1}}, "static.nonsense: no such field; expected one of continuous_actions, "),
+        ({"static": {"nonsense": 1}}, "static.nonsense: no such field; expected one of associator, "),
         ({"params": {"nonsense": 1}}, "params.nonsense: no such field; expected one of alpha, "),
         ({"num_envs": "8"}, "num_envs = '8': expected int"),
         ({"randomise": [1, 2]}, "randomise = [1, 2]: expected dict"),
