@@ -6,7 +6,6 @@ if __name__ == "__main__":
     cores.use()  # before gymnax is imported, which starts JAX
 
 import dataclasses
-import gc
 import math
 import resource
 import time
@@ -96,7 +95,6 @@ def check(options: SoakOptions) -> None:
 
 def resident_memory() -> float:
     """Megabytes of this process in memory now; where the system does not tell, the most so far."""
-    gc.collect()
     if STATM.exists():
         return int(STATM.read_text().split()[1]) * resource.getpagesize() / MEGABYTE
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / MEGABYTE
