@@ -180,7 +180,7 @@ def title_of(found: Findings, machine: dict[str, Any]) -> str:
     verdict = "VIOLATED: " + "; ".join(found.violations) if found.violations else "nothing was wrong"
     speed = found.steps / found.seconds if found.seconds else 0.0
     return (
-        f"{end}{played(found):,} steps, all finite where nothing else is said: {verdict}; "
+        f"{end}{played(found):,} steps: {verdict}; "
         f"memory {found.memory[0]:,.0f} MB after the warm-up, {found.memory[1]:,.0f} MB at the end; "
         f"{speed:,.0f} steps/s; {machine['processor']}, {jax.device_count()} of {machine['cores']} cores, "
         f"{machine['jax_backend']}"
