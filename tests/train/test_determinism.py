@@ -27,7 +27,7 @@ EVALUATION = """
 from train import evaluate
 assert evaluate.main("--run run --policies random index --episodes 4 --out evaluation".split()) == 0
 """
-SMALL = [f"--{name}={value}" for name, value in {**OPTIONS, "total-steps": 96, "warm-start": "none"}.items()]
+SMALL = [f"--{name}={value}" for name, value in {**OPTIONS, "total-steps": 64, "warm-start": "none"}.items()]
 DEFAULT = ["--total-steps", "16384", "--warm-start", "none"]
 
 
