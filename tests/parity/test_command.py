@@ -55,6 +55,7 @@ OTHER_PARTS = [
 ]
 
 
+@pytest.mark.slow
 def test_the_quick_run(tmp_path, capsys):
     """Everything that the full run does, in small."""
     readme = tmp_path / "README.md"
