@@ -47,11 +47,7 @@ def unscented_transform(
         Expected elevation, bearing, range `[3, T]`; innovation covariances `[3, 3, T]`,
         measurement noise included; covariances `[6, 3, T]` between state and detection.
     """
-    offsets = sigma_offsets(covariance, params)
-    relative = _relative_detections(mean, offsets)
-    expected, shift = _mean_detection(mean, relative, params)
-    differences = _differences(relative, shift)
-    S, C = _covariances(offsets, differences, shift, params)
+    expected, S, C, _ = _transform(mean, covariance, params)
     return expected, S, C
 
 
@@ -69,16 +65,24 @@ def cubature_transform(
     I. Arasaratnam, S. Haykin, "Cubature Kalman filters", IEEE Transactions on Automatic Control 54 (2009).
     """
     params = dataclasses.replace(params, alpha=1.0, beta=0.0, kappa=0.0)
-    offsets = sigma_offsets(covariance, params)
-    relative = _relative_detections(mean, offsets)
-    expected, shift = _mean_detection(mean, relative, params)
-    differences = _differences(relative, shift)
-    S, C = _covariances(offsets, differences, shift, params)
+    expected, S, C, differences = _transform(mean, covariance, params)
     if mean.dtype == jnp.float32:
         return expected, S, C
     left = jnp.stack([*(_sum_points(angle) / POINTS for angle in differences[:2]), jnp.zeros_like(mean[0])])
     of_means = expected[:, None] * left
     return expected, S + of_means + jnp.swapaxes(of_means, 0, 1), C + mean[:, None] * left
+
+
+def _transform(
+    mean: jax.Array, covariance: jax.Array, params: Params
+) -> tuple[jax.Array, jax.Array, jax.Array, tuple[jax.Array, ...]]:
+    """`unscented_transform`, and differences `[12 T]` of the points from the expected detections."""
+    offsets = sigma_offsets(covariance, params)
+    relative = _relative_detections(mean, offsets)
+    expected, shift = _mean_detection(mean, relative, params)
+    differences = _differences(relative, shift)
+    S, C = _covariances(offsets, differences, shift, params)
+    return expected, S, C, differences
 
 
 def unscented_weights(params: Params) -> tuple[jax.Array, jax.Array]:

@@ -44,6 +44,7 @@ from stonesoup.updater.kalman import (
 )
 
 from jaxtrack.params import Params, StaticParams
+from jaxtrack.tracker import DEFAULT
 from jaxtrack.types import POSITION, STATE_DIM, VELOCITY
 
 EPOCH = datetime.datetime(2000, 1, 1)
@@ -73,7 +74,7 @@ UPDATERS: dict[str, Callable[[Params], KalmanUpdater]] = {
 }
 """Stock updaters by the names of `jaxtrack.kalman.FILTERS`.
 
-The last one needs detections that were converted to positions: `translate.to_positions`.
+The last one needs detections that were converted to positions: `translate.to_position`.
 """
 
 ASSOCIATORS: dict[str, type[DataAssociator]] = {
@@ -101,8 +102,6 @@ DELETERS: dict[str, Callable[[Params], Deleter]] = {
     "update_time_steps": update_time_steps_deleter,
 }
 """Stock deleters by the names of `jaxtrack.lifecycle.DELETERS`."""
-
-DEFAULT = StaticParams()
 
 
 class ExactCartesianToElevationBearingRange(CartesianToElevationBearingRange):

@@ -9,8 +9,9 @@ from stonesoup.types.track import Track
 from stonesoup.types.update import Update
 
 from jaxtrack.params import Params, StaticParams
+from jaxtrack.tracker import DEFAULT
 from jaxtrack.types import NO_DETECTION, Tracks
-from reference.components import DEFAULT, build_components, time_of
+from reference.components import build_components, time_of
 from reference.translate import (
     TrackKey,
     as_vector,

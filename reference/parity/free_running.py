@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from jaxtrack.params import StaticParams
-from reference.components import DEFAULT
+from jaxtrack.tracker import DEFAULT
 from reference.parity.compare import TOLERANCE
 from reference.parity.episodes import Comparison, EpisodeTallies, compare_episode
 from reference.parity.oracle import Job, run_all

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from jaxtrack.params import StaticParams
+from jaxtrack.tracker import DEFAULT
 from jaxtrack.types import NO_DETECTION, STATE_DIM, Tracks
-from reference.components import DEFAULT
 from reference.parity.scenarios import Scenario
 from reference.pipeline import StepRecord, StoneSoupTracker
 

@@ -10,9 +10,8 @@ import numpy as np
 from jaxtrack import tracker
 from jaxtrack.lifecycle import no_tracks
 from jaxtrack.params import Params, StaticParams
-from jaxtrack.tracker import TrackerInfo
+from jaxtrack.tracker import DEFAULT, TrackerInfo
 from jaxtrack.types import Detections, Tracks
-from reference.components import DEFAULT
 from reference.parity.scenarios import Scenario
 
 MAX_TRACKS = 64
