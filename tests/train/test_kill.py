@@ -89,6 +89,7 @@ def test_killed_at_random_moments_and_resumed(start, whole, tmp_path, capsys):
             process.communicate(timeout=LIMIT)
             if process.returncode == 0:  # it was quicker
                 break
+            assert process.returncode == -signal.SIGKILL
             kills += 1
             done.append(updates(folder)[-1] if updates(folder) else 0)
             process = start("--resume", folder) if (folder / "config.json").exists() else start(*new(folder))
@@ -101,13 +102,14 @@ def test_killed_at_random_moments_and_resumed(start, whole, tmp_path, capsys):
 
 
 def wait_for_rows(process, folder):
-    """Waits until this process has written a row."""
+    """Waits until this process has written a row, or has ended."""
     path = folder / "metrics.csv"
     before, deadline = (path.stat().st_size if path.exists() else 0), time.monotonic() + LIMIT
     # Resuming cuts the file first, so that any change tells.
     while (size := path.stat().st_size if path.exists() else 0) <= before:
         before = min(before, size)
-        assert process.poll() is None, process.communicate()[0]
+        if process.poll() is not None:
+            return
         assert time.monotonic() < deadline
         time.sleep(0.01)
 
