@@ -14,13 +14,14 @@ import jax
 import jax.numpy as jnp
 
 from jaxtrack import kalman
+from jaxtrack.beam_means import beam_means
 from jaxtrack.env import one_by_one_if_small
 from jaxtrack.lifecycle import delete_uncertain_tracks
 from jaxtrack.observation import covariance_norms
 from jaxtrack.params import Params, StaticParams
 from jaxtrack.policies import sum_in_beams
 from jaxtrack.reward import TRACK_TERMS, reward_terms
-from jaxtrack.scan_map import beam_means, beam_sizes, mean_scan_value, update_scan_map
+from jaxtrack.scan_map import beam_sizes, mean_scan_value, update_scan_map
 from jaxtrack.sensor import in_beam, look_angles
 from jaxtrack.types import Detections, Tracks, Truths, position, where_rows
 

@@ -49,14 +49,21 @@ def one_by_one(function: Function) -> Function:
 
             return jax.lax.map(one, [leaf for leaf, each in zip(leaves, varies, strict=True) if each])
 
-        # The next `jax.vmap` must not turn the branches in the loop into choices either. XLA ends the
-        # process over an argument that is a constant, and over one that it found to be of no use: hence
-        # the barriers, and all arguments come back.
-        in_one = _as_call(one_by_one(loop), _ONE_KERNEL)
-        result, _ = jax.lax.optimization_barrier(in_one(*jax.lax.optimization_barrier(leaves)))
+        # The next `jax.vmap` must not turn the branches in the loop into choices either.
+        result = in_one_kernel(one_by_one(loop), *leaves)
         return result, jax.tree.map(lambda _: True, result)
 
     return looped
+
+
+def in_one_kernel(function: Function, *arguments: jax.Array) -> Any:
+    """``function(*arguments)``, on a CPU as a single kernel; not to be called inside another one."""
+    if jax.default_backend() != "cpu":
+        return function(*arguments)
+    # XLA ends the process over an argument that is a constant, and over one that it found to be of no
+    # use: hence the barriers, and all arguments come back.
+    called = _as_call(function, _ONE_KERNEL)
+    return jax.lax.optimization_barrier(called(*jax.lax.optimization_barrier(arguments)))[0]
 
 
 def rarely(needed: jax.Array, function: Function, arguments: tuple[Any, ...], otherwise: Any) -> Any:

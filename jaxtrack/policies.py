@@ -16,12 +16,13 @@ from typing import TYPE_CHECKING
 import jax
 import jax.numpy as jnp
 
+from jaxtrack.beam_means import beam_means
 from jaxtrack.kernel import one_by_one
 from jaxtrack.models import elevation_bearing_range
 from jaxtrack.observation import variances
 from jaxtrack.params import Params, StaticParams
 from jaxtrack.sampling import draw_index, first_largest
-from jaxtrack.scan_map import beam_means, beam_sizes, look_grid
+from jaxtrack.scan_map import beam_sizes, look_grid
 from jaxtrack.search_plan import search_plan
 from jaxtrack.sensor import frames, in_beams_of, look_number
 from jaxtrack.types import Tracks, position

@@ -122,5 +122,5 @@ def reward_terms(
 ) -> tuple[jax.Array, jax.Array]:
     """Weighted track term and weighted search term (negative); the reward is their sum."""
     track = params.track_weight * TRACK_TERMS[static.reward](before, after, truths, static, params)
-    search = -params.search_weight * mean_scan_value(scan_map**static.search_sharpness)
+    search = -params.search_weight * mean_scan_value(scan_map, static.search_sharpness)
     return track, search

@@ -4,18 +4,13 @@ The paper names a scan value without a formula (it points to arXiv 2502.13584). 
 ``1 - exp(-(t - t_last look) / tau)``: 1 where never seen, 0 inside the dwell just made.
 """
 
-from collections.abc import Callable
-
 import jax
 import jax.numpy as jnp
 
-from jaxtrack.kernel import stage
+from jaxtrack.kernel import add_up, stage
 from jaxtrack.models import direction
 from jaxtrack.params import Params, StaticParams
 from jaxtrack.sensor import in_beam, look_angles
-
-BAND_SHARE = 12
-"""`beam_means` takes the short way if no beam crosses more than this part of the map's rows."""
 
 
 def initial_scan_map(static: StaticParams) -> jax.Array:
@@ -29,32 +24,47 @@ def update_scan_map(scan_map: jax.Array, look: jax.Array, static: StaticParams, 
     return jnp.where(pixels_in_beam(look, static, params), 0.0, aged)
 
 
-def mean_scan_value(scan_map: jax.Array) -> jax.Array:
-    """Mean `[]` of a map `[M, M]`."""
+def mean_scan_value(scan_map: jax.Array, sharpness: int = 1) -> jax.Array:
+    """Mean `[]` of a map `[M, M]`, or of this power of its values."""
     # Rows first: neighbouring numbers can be added at once, a single sum goes one by one.
-    return jnp.mean(jnp.mean(scan_map, axis=0))
+    if sharpness == 1:
+        return jnp.mean(jnp.mean(scan_map, axis=0))
+    # XLA would take the powers one by one before a sum over rows, but not before a chain of sums.
+    rows = scan_map.shape[0] if scan_map.shape[0] % 2 else scan_map.shape[0] // 2
+    return jnp.mean(add_up((scan_map**sharpness).reshape(rows, -1))) / rows
 
 
 def pixels_in_beam(look: jax.Array, static: StaticParams, params: Params) -> jax.Array:
     """`[M, M]` whether a pixel lies in the beam of a look `[2]` (rad): `in_beam` of `pixel_directions`.
 
-    Of a grid only the angles of its rows and columns need sines and cosines.
+    Of a grid only the angles of its rows and columns need sines and cosines, and every pixel two products.
     """
-    ahead, aside, sine, cosine = _grid_directions(grid_angles(static, params), look[0])
-    look_sine, look_cosine = jnp.sin(look[1]), jnp.cos(look[1])
-    forward = cosine[:, None] * ahead
-    x = look_cosine * forward + (look_sine * sine)[:, None]
-    y = cosine[:, None] * aside
-    z = (look_cosine * sine)[:, None] - look_sine * forward
-    half_bearing, half_elevation = params.beam_azimuth / 2, params.beam_elevation / 2
-    in_bearing = jnp.abs(y) * jnp.cos(half_bearing) <= jnp.sin(half_bearing) * x
-    return in_bearing & (jnp.abs(z) <= jnp.sin(half_elevation))
+    cosine, height, margin, lift, drop = _edges(grid_angles(static, params), look, params)
+    cosine, height, lift = cosine[:, None], height[:, None], lift[:, None]
+    in_bearing = cosine * margin <= height
+    return in_bearing & (jnp.abs(lift - cosine * drop) <= jnp.sin(params.beam_elevation / 2))
 
 
 @stage
-def _grid_directions(angles: jax.Array, azimuth: jax.Array) -> tuple[jax.Array, ...]:
-    """Of columns: cosine and sine `[M]` of the azimuth less the look's. Of rows: sine and cosine `[M]`."""
-    return jnp.cos(angles - azimuth), jnp.sin(angles - azimuth), jnp.sin(angles), jnp.cos(angles)
+def _edges(angles: jax.Array, look: jax.Array, params: Params) -> tuple[jax.Array, ...]:
+    """What the edges of a beam need of rows and columns.
+
+    In the frame of the beam, with c and s the cosine and sine of a row's elevation, a pixel lies at
+    ``x = cos(look) c ahead + sin(look) s``, ``y = c aside``, ``z = cos(look) s - sin(look) c ahead``.
+    Inside are ``|y| cos(half) <= x sin(half)`` and ``|z| <= sin(half)``.
+
+    Returns:
+        Of rows `[M]` c, the part of x sin(half) without c, and that of z; of columns the parts with c of
+        ``|y| cos(half) - x sin(half)`` and of -z.
+    """
+    # The grid has the same angles along both axes.
+    sine, cosine = jnp.sin(angles), jnp.cos(angles)
+    (azimuth_sine, look_sine), (azimuth_cosine, look_cosine) = jnp.sin(look), jnp.cos(look)
+    ahead = azimuth_cosine * cosine + azimuth_sine * sine
+    aside = azimuth_cosine * sine - azimuth_sine * cosine
+    half = params.beam_azimuth / 2
+    margin = jnp.abs(aside) * jnp.cos(half) - look_cosine * ahead * jnp.sin(half)
+    return cosine, look_sine * sine * jnp.sin(half), margin, look_cosine * sine, look_sine * ahead
 
 
 def grid_angles(static: StaticParams, params: Params) -> jax.Array:
@@ -90,34 +100,3 @@ def beam_weights(static: StaticParams, params: Params) -> jax.Array:
 def beam_sizes(static: StaticParams, params: Params) -> jax.Array:
     """Number `[L * L]` of pixels in the beam of every look."""
     return jnp.sum(beam_weights(static, params) > 0, axis=1)
-
-
-def beam_means(static: StaticParams, params: Params) -> Callable[[jax.Array], jax.Array]:
-    """The function of a map `[M, M]` that gives the mean scan value in the beam of every look `[L * L]`.
-
-    `beam_weights` times the map. A beam crosses few rows of the map, the same for all looks of
-    one elevation: where they are at most a twelfth, only those are multiplied.
-    """
-    looks, pixels = static.num_looks, static.map_size
-    height = -(-pixels // BAND_SHARE)
-    # Elevation, azimuth, row, column.
-    grid = jnp.swapaxes(beam_weights(static, params).reshape(looks, looks, pixels, pixels), 0, 1)
-    crossed = jnp.any(grid > 0, axis=(1, 3))
-    first = jnp.minimum(jnp.argmax(crossed, axis=1), pixels - height)
-
-    def band(matrix: jax.Array, first: jax.Array, axis: int) -> jax.Array:
-        return jax.lax.dynamic_slice_in_dim(matrix, first, height, axis)
-
-    enough = jnp.sum(jax.vmap(band, in_axes=(0, 0, None))(crossed, first, 0)) == jnp.sum(crossed)
-    weights = jax.vmap(band, in_axes=(0, 0, None))(grid, first, 1).reshape(looks, looks, -1)
-    bands = list(zip(jnp.unstack(weights), jnp.unstack(first), strict=True))
-
-    def of_crossed_rows(scan_map: jax.Array) -> jax.Array:
-        means = [weights @ band(scan_map, first, 0).ravel() for weights, first in bands]
-        return jnp.stack(means, axis=1).ravel()
-
-    def of_all_rows(scan_map: jax.Array) -> jax.Array:
-        # The matrix is made anew: a loop around a branch would copy it at every turn.
-        return beam_weights(static, params) @ scan_map.ravel()
-
-    return lambda scan_map: jax.lax.cond(enough, of_crossed_rows, of_all_rows, scan_map)

@@ -10,9 +10,10 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
+from jaxtrack.beam_means import beam_means
 from jaxtrack.params import Params, StaticParams
 from jaxtrack.sampling import first_largest
-from jaxtrack.scan_map import beam_means, beam_sizes, initial_scan_map, look_grid, pixels_in_beam
+from jaxtrack.scan_map import beam_sizes, initial_scan_map, look_grid, pixels_in_beam
 
 FINENESS = 3
 """Pixels of the plan's map along one pixel of the scan map."""

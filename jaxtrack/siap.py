@@ -104,19 +104,33 @@ class _Behind(NamedTuple):
     spent: jax.Array
 
 
+class _View(NamedTuple):
+    """What holds for all steps from `since` on to the one on which it was found.
+
+    Attributes:
+        together: `[T, N]` whether the slot's track follows the truth.
+        going_on: `[T, N]` whether it does so until the next step, too.
+        stretch_end: `[N]` see `tracks_needed`.
+        since: `[]` the first step.
+    """
+
+    together: jax.Array
+    going_on: jax.Array
+    stretch_end: jax.Array
+    since: jax.Array
+
+
 class _Found(NamedTuple):
     """What one step of `_look_back` finds.
 
     Attributes:
         counts: J, JT, N, NA, sums of position and velocity errors, as `_ratios` takes them.
         followed: time (s) to the next step, summed over the truths that are followed until then.
-        spent: `[N]` longest time (s) of a track with the truth, from this step on.
         stretch_end: `[N]` see `tracks_needed`.
     """
 
     counts: tuple[jax.Array, ...]
     followed: jax.Array
-    spent: jax.Array
     stretch_end: jax.Array
 
 
@@ -126,17 +140,15 @@ def _over_record(
     """Of a record: counts `[K]`, followed times `[K]`, longest times `[N]`, changes of track `[N]`."""
     begun = begins(tracks)
     stretches = associate_tracks_to_truths(truths, tracks, begun, params)
-    found = _look_back(truths, tracks, begun, stretches, durations)
+    found, longest = _look_back(truths, tracks, begun, stretches, durations)
     changes = jnp.maximum(tracks_needed(found.stretch_end, truths.alive) - 1, 0)
-    return found.counts, found.followed, found.spent, changes
+    return found.counts, found.followed, longest, changes
 
 
 def _look_back(
     truths: Truths, tracks: Tracks, begun: jax.Array, stretches: Stretch, durations: jax.Array
-) -> _Found:
+) -> tuple[_Found, jax.Array]:
     """Goes from the last step to the first: a stretch is known from its end on.
-
-    The leaves of the result are `[K, ...]`, but for `spent`, whose maximum over the record is `[N]`.
 
     Args:
         truths: `[K, N, ...]`.
@@ -144,38 +156,89 @@ def _look_back(
         begun: `[K, T]` where a slot takes up a new track.
         stretches: `[K + 1, T]` of `associate_tracks_to_truths`.
         durations: `[K]` time to the next step (s).
+
+    Returns:
+        What each step finds, `[K, ...]`, and the longest time (s) of a track with every truth `[N]`.
     """
     num_steps, num_truths = truths.alive.shape
     max_tracks = begun.shape[1]
 
-    def one_step(carry: tuple[_Behind, jax.Array], now: Any) -> tuple[tuple[_Behind, jax.Array], _Found]:
-        behind, longest = carry
+    def one_step(carry: _Carry, now: Any) -> tuple[_Carry, _Found]:
         truths, tracks, begins, closed, duration, step = now
-        closes = jnp.any(closed.truth != NO_TRUTH)
-        behind = jax.lax.cond(closes, _take_up, lambda behind, closed: behind, behind, closed)
-        together = (behind.start <= step) & (step <= behind.end)
-        going_on = together & (step < behind.end)
-        spent = behind.spent + jnp.where(going_on, duration, 0.0)
-        longest = jnp.maximum(longest, jnp.max(spent, axis=0))
+        # A track follows its truth for hundreds of steps, on which nothing changes but errors.
+        changes = jnp.any(closed.truth != NO_TRUTH) | (step < carry.view.since)
+        carry = jax.lax.cond(changes, _look_anew, lambda carry, *_: carry, carry, closed, step)
+        carry = carry._replace(waiting=carry.waiting + duration)
         found = _Found(
-            counts=_counts(truths, tracks, together),
-            followed=duration * jnp.sum(jnp.any(going_on, axis=0)),
-            spent=longest,
-            stretch_end=_stretch_end(behind, together),
+            counts=_counts(truths, tracks, carry.view.together),
+            followed=duration * jnp.sum(jnp.any(carry.view.going_on, axis=0)),
+            stretch_end=carry.view.stretch_end,
         )
-        # Before its first step the slot held another track, or none.
-        final = jnp.where(begins[:, None], _NEVER, behind.final)
-        spent = jnp.where(begins[:, None], 0.0, spent)
-        return (behind._replace(final=final, spent=spent), longest), found
+        return jax.lax.cond(jnp.any(begins), _forget, lambda carry, _: carry, carry, begins), found
 
     never = jnp.full((max_tracks, num_truths), _NEVER)
     nothing = jnp.zeros((max_tracks, num_truths), durations.dtype)
+    nowhere = jnp.zeros_like(never, dtype=bool)
+    start = _Carry(
+        behind=_Behind(never, never, never, nothing),
+        view=_View(nowhere, nowhere, never[0], jnp.asarray(num_steps)),
+        waiting=nothing[0, 0],
+        longest=nothing[0],
+    )
     steps = jnp.arange(num_steps)
     closed = jax.tree.map(lambda leaf: leaf[1:], stretches)
     rows = (truths, tracks, begun, closed, durations, steps)
-    start = (_Behind(never, never, never, nothing), nothing[0])
-    (_, longest), found = jax.lax.scan(one_step, start, rows, reverse=True)
-    return found._replace(spent=longest)
+    carry, found = jax.lax.scan(one_step, start, rows, reverse=True)
+    return found, _spend(carry).longest
+
+
+class _Carry(NamedTuple):
+    """What `_look_back` takes from step to step.
+
+    Attributes:
+        behind: what is remembered of each pair.
+        view: which of them are together.
+        waiting: `[]` time (s) with this view that `behind` does not have yet.
+        longest: `[N]` longest time (s) of a track with the truth.
+    """
+
+    behind: _Behind
+    view: _View
+    waiting: jax.Array
+    longest: jax.Array
+
+
+def _spend(carry: _Carry) -> _Carry:
+    """Puts the waiting time down to the pairs that were together."""
+    spent = carry.behind.spent + jnp.where(carry.view.going_on, carry.waiting, 0.0)
+    longest = jnp.maximum(carry.longest, jnp.max(spent, axis=0))
+    return carry._replace(
+        behind=carry.behind._replace(spent=spent), waiting=jnp.zeros_like(carry.waiting), longest=longest
+    )
+
+
+def _look_anew(carry: _Carry, closed: Stretch, step: jax.Array) -> _Carry:
+    """Takes up what was closed on the step after this one, and who is together now."""
+    carry = _spend(carry)
+    behind = _take_up(carry.behind, closed)
+    started = behind.start <= step
+    together = started & (step <= behind.end)
+    # The next step back on which something changes: a start is left, an end is met, or was met now.
+    change = jnp.where(together, behind.start - 1, _NEVER)
+    change = jnp.where(started & (behind.end <= step), behind.end - (behind.end == step), change)
+    view = _View(
+        together, together & (step < behind.end), _stretch_end(behind, together), jnp.max(change) + 1
+    )
+    return carry._replace(behind=behind, view=view)
+
+
+def _forget(carry: _Carry, begins: jax.Array) -> _Carry:
+    """Before its first step a slot held another track, or none."""
+    carry = _spend(carry)
+    behind = carry.behind
+    final = jnp.where(begins[:, None], _NEVER, behind.final)
+    spent = jnp.where(begins[:, None], 0.0, behind.spent)
+    return carry._replace(behind=behind._replace(final=final, spent=spent))
 
 
 def _take_up(behind: _Behind, closed: Stretch) -> _Behind:

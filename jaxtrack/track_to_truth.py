@@ -117,11 +117,23 @@ def associate_tracks_to_truths(truths: Truths, tracks: Tracks, begun: jax.Array,
 
     def one_step(following: Following, now: tuple[Any, ...]) -> tuple[Following, Stretch]:
         truths, tracks, begins, step = now
-        left = _close(following, begins)
-        following = _choose(begins, nobody, following)
-        after, ended = follow(following, nearest_truth(truths, tracks, params), step, params)
-        active = tracks.active
-        return _choose(active, after, following), _choose(begins, left, _choose(active, ended, left))
+        nearest = nearest_truth(truths, tracks, params)
+        settled = ~begins & (~tracks.active | (nearest == following.truth) & (nearest != NO_TRUTH))
+
+        def go_on() -> tuple[Following, Stretch]:
+            end = jnp.where(tracks.active, step, following.end)
+            misses = jnp.where(tracks.active, 0, following.misses)
+            return following.replace(end=end, misses=misses), _close(following, begins)
+
+        def change() -> tuple[Following, Stretch]:
+            left = _close(following, begins)
+            known = _choose(begins, nobody, following)
+            after, ended = follow(known, nearest, step, params)
+            closed = _choose(begins, left, _choose(tracks.active, ended, left))
+            return _choose(tracks.active, after, known), closed
+
+        # Mostly every track is again nearest to the truth that it follows: `follow` says no more then.
+        return jax.lax.cond(jnp.all(settled), go_on, change)
 
     steps = jnp.arange(num_steps)
     end, closed = jax.lax.scan(one_step, nobody, (truths, tracks, begun, steps))

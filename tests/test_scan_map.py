@@ -100,15 +100,3 @@ def test_a_beam_between_the_pixels_has_no_weight():
     narrow = Params(beam_azimuth=1e-4, beam_elevation=1e-4)
     weights = beam_weights(StaticParams(map_size=2, num_looks=3), narrow)
     assert float(jnp.sum(weights[4])) == 0.0
-
-
-@pytest.mark.parametrize("degrees", [9, 40])
-def test_beam_means_are_the_weights_times_the_map(degrees):
-    """With narrow beams by the rows they cross, with wide ones by all."""
-    static, params = StaticParams(map_size=24, num_looks=5), Params(beam_elevation=np.radians(degrees))
-    values = np.random.default_rng(2).uniform(size=(3, 24, 24))
-    found = jax.jit(lambda values, params: jax.vmap(scan_map.beam_means(static, params))(values))(
-        values, params
-    )
-    expected = values.reshape(3, -1) @ np.asarray(beam_weights(static, params)).T
-    np.testing.assert_allclose(found, expected, rtol=1e-5)

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from jaxtrack import Params, StaticParams
+from jaxtrack.beam_means import beam_means
 from jaxtrack.models import direction
 from jaxtrack.scan_map import (
-    beam_means,
     beam_sizes,
     initial_scan_map,
     look_grid,

@@ -11,11 +11,12 @@ import jax.numpy as jnp
 from flax import linen as nn
 from flax import struct
 
+from jaxtrack.beam_means import beam_means
 from jaxtrack.models import direction
 from jaxtrack.observation import Observation
 from jaxtrack.params import Params, StaticParams
 from jaxtrack.policies import removed_variance
-from jaxtrack.scan_map import beam_means, beam_sizes, look_grid
+from jaxtrack.scan_map import beam_sizes, look_grid
 from jaxtrack.search_plan import search_plan
 from jaxtrack.sensor import in_beams, look_number
 from train.orthogonal import orthogonal

@@ -10,10 +10,10 @@ import pytest
 from stonesoup.sensor.radar.radar import RadarElevationBearingRange
 
 from jaxtrack import Params, StaticParams, policies
+from jaxtrack.beam_means import beam_means
 from jaxtrack.env import SearchTrack
 from jaxtrack.platform import from_platform, rotation
 from jaxtrack.policies import POLICIES
-from jaxtrack.scan_map import beam_means
 from reference.components import EPOCH, noise_covariance, time_of
 from reference.managers import ManagedRadar
 from reference.parity.environment import Played, draws_of
