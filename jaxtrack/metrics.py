@@ -1,5 +1,6 @@
 """How good a track list is, given the truths: for evaluation, never for the agent."""
 
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -7,8 +8,8 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from jaxtrack.assignment import NOBODY, assign
-from jaxtrack.kernel import add_up, one_by_one
+from jaxtrack.assignment import assign
+from jaxtrack.kernel import add_up, one_by_one, stage
 from jaxtrack.observation import covariance_norms
 from jaxtrack.params import Params
 from jaxtrack.types import Scalar, Tracks, Truths, position
@@ -64,6 +65,19 @@ def position_distances(truths: Truths, tracks: Tracks) -> jax.Array:
     return jnp.where(truths.alive[:, None] & tracks.active[None], distances, jnp.inf)
 
 
+@stage
+def nearest(distances: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Distance and number `[T]` of the truth nearest to every track, the first of equals, of `[N, T]`."""
+    Row = tuple[jax.Array, jax.Array]
+
+    def nearer(a: Row, b: Row) -> Row:
+        return jnp.minimum(a[0], b[0]), jnp.where(b[0] < a[0], b[1], a[1])
+
+    # Truth by truth for all tracks at once: a CPU works out `jnp.argmin` number by number.
+    rows = [(row, jnp.asarray(number)) for number, row in enumerate(jnp.unstack(distances))]
+    return functools.reduce(nearer, rows)
+
+
 def pairwise_distances(a: jax.Array, b: jax.Array) -> jax.Array:
     """Euclidean distances `[N, T]` of vectors `[N, 3]` from vectors `[T, 3]`."""
     return jnp.sqrt(add_up((a[:, None] - b[None]) ** 2, axis=-1))
@@ -93,8 +107,8 @@ def gospa_step(
     Returns:
         The history after this step, and the metric.
     """
-    single, slot = _gospa(truths, tracks, params)
-    has_track = slot != NOBODY
+    single, assigned = _gospa(truths, tracks, params)
+    has_track, slot = jnp.any(assigned, axis=1), jnp.argmax(assigned, axis=1)
     birth_step, birth_detection = tracks.birth_step[slot], tracks.birth_detection[slot]
     counts = truths.alive & jnp.any(tracks.active)
 
@@ -131,31 +145,31 @@ def gospa_over_time(truths: Truths, tracks: Tracks, params: Params) -> Gospa:
 
 
 def _gospa(truths: Truths, tracks: Tracks, params: Params) -> tuple[Gospa, jax.Array]:
-    """GOSPA of one step, and the slot `[N]` assigned to every truth, or `NOBODY`."""
+    """GOSPA of one step, and which truths and tracks are assigned to each other, `[N, T]`."""
     c, p = params.gospa_cutoff, params.gospa_order
-    distances = jnp.minimum(position_distances(truths, tracks), c)
-    slot = one_by_one(_match)(*jax.lax.stop_gradient((distances, c, p)))
-    close = slot != NOBODY
-    assigned = jnp.take_along_axis(distances, jnp.maximum(slot, 0)[:, None], axis=1)[:, 0]
-    localisation = jnp.sum(jnp.where(close, assigned**p, 0.0))
+    distances = position_distances(truths, tracks)
+    assigned = one_by_one(_match)(*jax.lax.stop_gradient((distances, c, p)))
+    # A track has one truth at most.
+    close, error = jnp.any(assigned, axis=0), jnp.sum(jnp.where(assigned, distances, 0.0), axis=0)
+    localisation = jnp.sum(jnp.where(close, jnp.where(close, error, 1.0) ** p, 0.0))
     missed = (jnp.sum(truths.alive) - jnp.sum(close)) * c**p / 2
     false = (jnp.sum(tracks.active) - jnp.sum(close)) * c**p / 2
     distance = (localisation + missed + false) ** (1 / p)
-    return Gospa(distance, localisation, missed, false, jnp.zeros_like(distance)), slot
+    return Gospa(distance, localisation, missed, false, jnp.zeros_like(distance)), assigned
 
 
 def _match(distances: jax.Array, cutoff: Scalar, order: Scalar) -> jax.Array:
-    """Slot `[N]` of every truth, or `NOBODY`, by the cheapest assignment of `distances` `[N, T]`."""
+    """Which pairs closer than the cut-off the cheapest assignment of `distances` `[N, T]` makes."""
     close = distances < cutoff
-    contested = jnp.any(jnp.sum(close, axis=0) > 1) | jnp.any(jnp.sum(close, axis=1) > 1)
+    pairs = jnp.sum(close)
+    contested = (jnp.sum(jnp.any(close, axis=0)) < pairs) | (jnp.sum(jnp.any(close, axis=1)) < pairs)
 
     def cheapest() -> jax.Array:
-        return assign(jnp.where(close, distances / cutoff, 1.0) ** order)
+        slot = assign(jnp.where(close, distances / cutoff, 1.0) ** order)
+        return close & (jnp.arange(close.shape[1]) == slot[:, None])
 
-    # Mostly no two compete: then there is one way to pair all that are close.
-    slot = jax.lax.cond(contested, cheapest, lambda: jnp.argmax(close, axis=1))
-    within = close & (jnp.arange(close.shape[1]) == slot[:, None])
-    return jnp.where(jnp.any(within, axis=1), slot, NOBODY)
+    # Mostly no two compete: then all that are close are pairs.
+    return jax.lax.cond(contested, cheapest, lambda: close)
 
 
 class BasicMetrics(struct.PyTreeNode):
@@ -226,8 +240,9 @@ def uncertainty_per_truth(truths: Truths, tracks: Tracks, params: Params) -> jax
     dropping tracks.
     """
     near = position_distances(truths, tracks) < params.gospa_cutoff
-    norms = jnp.where(near, covariance_norms(tracks)[None], jnp.inf)
-    best = jnp.minimum(jnp.min(norms, axis=-1), params.deletion_threshold)
+    # Track by track for all truths at once: a CPU takes minima along the last axis number by number.
+    norms = jnp.where(near.T, covariance_norms(tracks)[:, None], params.deletion_threshold)
+    best = jnp.minimum(jnp.min(norms, axis=0), params.deletion_threshold)
     total = jnp.sum(jnp.where(truths.alive, best, 0.0))
     return total / jnp.maximum(jnp.sum(truths.alive), 1)
 

@@ -8,14 +8,13 @@ dated back, that exists for records only; `follow` alone can be carried from ste
 Where several truths are equally near, the lowest wins; Stone Soup goes by the order of a set.
 """
 
-import functools
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 from flax import struct
 
-from jaxtrack.metrics import position_distances
+from jaxtrack.metrics import nearest, position_distances
 from jaxtrack.params import Params
 from jaxtrack.types import NO_TRUTH, Scalar, Tracks, Truths
 
@@ -143,13 +142,7 @@ def associate_tracks_to_truths(truths: Truths, tracks: Tracks, begun: jax.Array,
 
 def nearest_truth(truths: Truths, tracks: Tracks, params: Params) -> jax.Array:
     """`[T]` truth nearest to every track and closer than the threshold, or `NO_TRUTH`."""
-
-    def nearer(a: tuple[jax.Array, Any], b: tuple[jax.Array, Any]) -> tuple[jax.Array, Any]:
-        return jnp.minimum(a[0], b[0]), jnp.where(b[0] < a[0], b[1], a[1])
-
-    # Truth by truth for all tracks at once: a CPU works out `jnp.argmin` number by number.
-    distances = jnp.unstack(position_distances(truths, tracks))
-    distance, truth = functools.reduce(nearer, [(row, number) for number, row in enumerate(distances)])
+    distance, truth = nearest(position_distances(truths, tracks))
     return jnp.where(distance < params.siap_threshold, truth, NO_TRUTH)
 
 

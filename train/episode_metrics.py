@@ -10,6 +10,7 @@ from scipy.stats import chi2
 from jaxtrack import metrics
 from jaxtrack.env import SearchTrack
 from jaxtrack.episode import EnvState, StepRecord
+from jaxtrack.kernel import stage
 from jaxtrack.params import Params
 from jaxtrack.reward import reward_terms
 from jaxtrack.scan_map import mean_scan_value
@@ -153,22 +154,26 @@ def mean_wait(alive: jax.Array, tracked: jax.Array, params: Params) -> jax.Array
     return params.time_step * jnp.sum(jnp.where(lived, steps, 0)) / jnp.maximum(jnp.sum(lived), 1)
 
 
+@stage
 def nees(error: jax.Array, covariance: jax.Array) -> jax.Array:
     """Normalised estimation errors squared ``e' P^-1 e`` `[...]` of errors `[..., 6]`, `[..., 6, 6]`.
 
-    ``|w|^2`` with ``e = L w``, L the Cholesky factor of P, entry by entry: without arrays of entries
-    a CPU works it out in one loop over the tracks.
+    ``sum of w^2 / d`` with ``P = L D L'`` and ``e = L w``, entry by entry: without arrays of entries
+    a CPU works it out in few loops over the tracks.
     """
-    factor: list[list[jax.Array]] = []
+    products: list[list[jax.Array]] = []  # rows of L D
+    inverse: list[jax.Array] = []
     white: list[jax.Array] = []
     for i in range(STATE_DIM):
+        product: list[jax.Array] = []
         row: list[jax.Array] = []
         for j in range(i):
-            row.append((covariance[..., i, j] - _dot(row, factor[j])) / factor[j][j])
-        row.append(jnp.sqrt(covariance[..., i, i] - _dot(row, row)))
-        white.append((error[..., i] - _dot(row, white)) / row[i])
-        factor.append(row)
-    return _dot(white, white)
+            product.append(covariance[..., i, j] - _dot(row, products[j]))
+            row.append(product[j] * inverse[j])
+        inverse.append(1 / (covariance[..., i, i] - _dot(row, product)))
+        white.append(error[..., i] - _dot(row, white))
+        products.append(product)
+    return _dot([w * w for w in white], inverse)
 
 
 def _dot(a: list[jax.Array], b: list[jax.Array]) -> jax.Array:
@@ -199,8 +204,8 @@ def _consistency(
     truths: Truths, tracks: Tracks, distances: jax.Array, params: Params
 ) -> dict[str, jax.Array]:
     """NEES over the tracks with a truth within the cut-off: sum, number, and how many in the band."""
-    nearest = jnp.argmin(distances, axis=0)
-    near = jnp.min(distances, axis=0) < params.gospa_cutoff
+    distance, nearest = metrics.nearest(distances)
+    near = distance < params.gospa_cutoff
     error = jnp.where(near[:, None], truths.state[nearest] - tracks.mean, 0.0)
     covariance = jnp.where(near[:, None, None], tracks.covariance, jnp.eye(STATE_DIM))
     value = nees(error, covariance)
