@@ -257,6 +257,43 @@ def test_the_same_seed_gives_the_same_numbers(whole, start, tmp_path):
     assert_same_result(tmp_path / "run", whole[0])
 
 
+def test_a_seed_among_several_ends_as_it_does_alone(whole, start, tmp_path):
+    assert start(tmp_path / "several", "--seeds", 2) == 0
+    assert_same_result(tmp_path / "several/seed0", whole[0])
+    assert start(tmp_path / "alone", "--seed", 1) == 0
+    assert_same_result(tmp_path / "several/seed1", tmp_path / "alone")
+    assert read_rows(tmp_path / "alone")[0]["reward"] != read_rows(whole[0])[0]["reward"]
+
+
+@pytest.mark.slow
+def test_several_seeds_are_compiled_once_and_compared_once(whole, tmp_path, capsys):
+    """With a program of their own: that of the first seed serves the second."""
+    folder = tmp_path / "runs"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(evaluate, "POLICIES", BASELINES)
+        assert ppo.main([*SMALL, "--seed", "1", "--seeds", "2", "--out", str(folder)]) == 0
+        assert ppo.main([*SMALL, "--seed", "2", "--out", str(tmp_path / "alone")]) == 0
+        assert ppo.main(["--resume", str(folder)]) == 0
+        assert evaluate.main(["--run", str(folder), "--episodes", "2", "--out", str(tmp_path / "again")]) == 0
+    said = capsys.readouterr().out
+    assert said.count("compiled in") == 2 + 3  # by two trainings and three comparisons
+    assert "nothing is left to do" in said
+    assert_same_result(folder / "seed2", tmp_path / "alone")
+    assert all((folder / name).stat().st_size > 1000 for name in PICTURES if name != "learning_curve.png")
+    assert sorted(path.name for path in (folder / "seed2").iterdir()) == [
+        "checkpoints",
+        "config.json",
+        "learning_curve.png",
+        "metrics.csv",
+    ]
+    results, again = (
+        json.loads((each / "results.json").read_text()) for each in (folder, tmp_path / "again")
+    )
+    assert results["policies"]["beams"]["training_seeds"] == [1, 2]
+    gospa = [each["policies"]["beams"]["metrics"]["gospa"]["by_training_seed"] for each in (results, again)]
+    np.testing.assert_allclose(*gospa, rtol=1e-4)
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [

@@ -1,5 +1,6 @@
-"""Several seeds in one command: each as if it were alone, stopped and resumed together, compared at the end."""
+"""Several seeds in one command: each as if it were alone, resumed together, compared at the end."""
 
+import contextlib
 import io
 import json
 import os
@@ -35,8 +36,8 @@ def init(key, params):
 class Command:
     """The command with a made-up training, in a folder of its own; keeps what was compiled and evaluated."""
 
-    def __init__(self, folder, monkeypatch, capsys):
-        self.folder, self.monkeypatch, self.capsys = folder, monkeypatch, capsys
+    def __init__(self, folder):
+        self.folder = folder
         self.compiled, self.evaluated, self.steps = 0, [], 0
 
     def __call__(self, *arguments, step=step):
@@ -54,33 +55,49 @@ class Command:
             self.evaluated.append((weights, trained, folders))
 
         self.folder.mkdir(exist_ok=True)
-        with self.monkeypatch.context() as patch:
+        out, err = io.StringIO(), io.StringIO()
+        said = contextlib.redirect_stdout(out), contextlib.redirect_stderr(err)
+        with pytest.MonkeyPatch.context() as patch, said[0], said[1]:
             patch.chdir(self.folder)
             patch.setattr(ppo, "compile_training", compile_nothing)
             patch.setattr(ppo, "evaluate_agent", evaluate)
             patch.setattr("sys.argv", ["ppo", *map(str, arguments)])
             with pytest.raises(SystemExit) as stop:
                 run(ppo.main)
-        said = self.capsys.readouterr()
-        assert "Traceback" not in said.err
-        return stop.value.code, " ".join(said.out.split()), said.err
-
-
-@pytest.fixture
-def command(tmp_path, monkeypatch, capsys):
-    """Commands, each in a folder of its own."""
-    (tmp_path / "config.json").write_text(json.dumps({**to_dict(CONFIG), "evaluation_episodes": 7}))
-    return lambda name: Command(tmp_path / name, monkeypatch, capsys)
+        assert "Traceback" not in err.getvalue()
+        return stop.value.code, " ".join(out.getvalue().split()), err.getvalue()
 
 
 START = ("--config", "../config.json", "--out", "runs")
 
 
+def write_configuration(folder):
+    """The configuration file that all commands take, beside their folders."""
+    (folder / "config.json").write_text(json.dumps({**to_dict(CONFIG), "evaluation_episodes": 7}))
+
+
 @pytest.fixture
-def whole(command):
-    """Seeds 5 to 7 that nothing disturbed."""
-    train = command("whole")
+def command(tmp_path):
+    """Commands, each in a folder of its own."""
+    write_configuration(tmp_path)
+    return lambda name: Command(tmp_path / name)
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """Seeds 5 to 7 that nothing disturbed; not to be written to."""
+    folder = tmp_path_factory.mktemp("seeds")
+    write_configuration(folder)
+    train = Command(folder / "whole")
     assert train(*START, "--seeds", 3)[0] == 0
+    return train
+
+
+@pytest.fixture
+def copied(whole, command):
+    """The same in a folder that may be written to."""
+    train = command("copied")
+    shutil.copytree(whole.folder, train.folder)
     return train
 
 
@@ -97,7 +114,7 @@ def contents(folder):
 def test_the_folder_of_a_seed_is_that_of_a_run_alone(whole, command):
     assert whole.compiled == 1
     assert sorted(os.listdir(whole.folder / "runs")) == ["seed5", "seed6", "seed7", SEEDS]
-    for seed in (5, 6, 7):
+    for seed in (5, 7):
         alone = command(f"alone{seed}")
         code, _, _ = alone("--config", "../config.json", "--seed", seed, "--out", f"runs/seed{seed}")
         assert code == 0
@@ -141,7 +158,7 @@ def assert_same_runs(one, other):
         assert (a / "config.json").read_bytes() == (b / "config.json").read_bytes()
 
 
-@pytest.mark.parametrize("number", [1, 6, 10, 11, 17, 30])
+@pytest.mark.parametrize("number", [1, 10, 15])
 def test_killed_and_resumed_they_end_as_if_they_had_not_been(whole, command, number):
     train = command("killed")
     assert train(*START, "--seeds", 3, step=at_step(number, killed))[0] == 9
@@ -155,8 +172,7 @@ def test_killed_and_resumed_they_end_as_if_they_had_not_been(whole, command, num
     assert (list(weights), trained.evaluation_episodes) == ([5, 6, 7], 9)
 
 
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
-@pytest.mark.parametrize("at", [13, 20])
+@pytest.mark.parametrize(("number", "code", "at"), [(signal.SIGINT, 130, 13), (signal.SIGTERM, 143, 20)])
 def test_a_signal_leaves_checkpoints_and_says_how_to_go_on(whole, command, monkeypatch, number, code, at):
     train, write, rows = command("stopped"), MetricsFile.write, []
 
@@ -184,7 +200,7 @@ def test_a_signal_leaves_checkpoints_and_says_how_to_go_on(whole, command, monke
 def test_one_of_them_can_be_resumed_alone(whole, command):
     train = command("alone")
     train(*START, "--seeds", 3, step=at_step(15, killed))
-    assert train("--resume", "runs/seed6")[0] == 0
+    assert train("--resume", "runs/seed6", "--seeds", 1, "--seed", 6)[0] == 0
     ((weights, trained, _),) = train.evaluated
     assert (list(weights), trained.folder.name) == ([6], "seed6")
     assert train("--resume", "runs")[0] == 0
@@ -206,29 +222,25 @@ def test_when_one_diverges_the_others_are_trained_and_nothing_is_compared(comman
     assert [updates(train.folder / f"runs/seed{seed}")[-1] for seed in (5, 6, 7)] == [10, 4, 10]
 
 
-def test_finished_ones_say_so(whole):
-    assert whole("--resume", "runs")[0] == 0  # trained, but the comparison left nothing
-    assert len(whole.evaluated) == 2
-    code, said, _ = whole("--resume", "runs", "--evaluation-episodes", 0)
-    assert (code, len(whole.evaluated)) == (0, 2)
+def test_finished_ones_say_so(copied):
+    assert copied("--resume", "runs")[0] == 0  # trained, but the comparison left nothing
+    assert len(copied.evaluated) == 1
+    code, said, _ = copied("--resume", "runs", "--evaluation-episodes", 0)
+    assert (code, len(copied.evaluated)) == (0, 1)
     assert "the training had finished, nothing is left to do" in said
-    (whole.folder / "runs/results.json").write_text("{}")
-    assert "the training had finished, nothing is left to do" in whole("--resume", "runs")[1]
-    assert (whole.compiled, whole.steps, len(whole.evaluated)) == (1, 3 * UPDATES, 2)
+    (copied.folder / "runs/results.json").write_text("{}")
+    assert "the training had finished, nothing is left to do" in copied("--resume", "runs")[1]
+    assert (copied.compiled, copied.steps, len(copied.evaluated)) == (0, 0, 1)
 
 
-def test_the_folder_may_move(whole, command):
-    train = command("moved")
-    train(*START, "--seeds", 3, step=at_step(15, killed))
-    (train.folder / "runs").rename(train.folder / "elsewhere")
-    assert train("--resume", "elsewhere")[0] == 0
-    for seed in (5, 6, 7):
-        assert_same(
-            *(
-                load_newest(folder / f"seed{seed}", print).arrays
-                for folder in (train.folder / "elsewhere", whole.folder / "runs")
-            )
-        )
+def test_the_folder_may_move(whole, copied):
+    runs, elsewhere = copied.folder / "runs", copied.folder / "elsewhere"
+    runs.rename(elsewhere)
+    shutil.rmtree(elsewhere / "seed7")
+    assert copied("--resume", "elsewhere")[0] == 0
+    assert copied.steps == UPDATES
+    saved = [load_newest(each / "seed7", print).arrays for each in (elsewhere, whole.folder / "runs")]
+    assert_same(*saved)
 
 
 @pytest.mark.parametrize(
@@ -264,7 +276,6 @@ def test_options_that_would_change_them_are_refused(whole, options, message):
     code, _, error = whole("--resume", "runs", *options)
     assert code == 2
     assert message in error
-    assert whole("--resume", "runs", "--seeds", 3, "--seed", 5)[0] == 0
 
 
 def test_a_single_run_is_not_resumed_as_several(command):
@@ -288,18 +299,17 @@ def test_a_single_run_is_not_resumed_as_several(command):
         ),
     ],
 )
-def test_a_damaged_folder_is_named(whole, text, message):
-    (whole.folder / "runs" / SEEDS).write_text(text)
-    code, _, error = whole("--resume", "runs")
+def test_a_damaged_folder_is_named(copied, text, message):
+    (copied.folder / "runs" / SEEDS).write_text(text)
+    code, _, error = copied("--resume", "runs")
     assert code == 2
     assert message in error
     assert error.count("\n") == 1
 
 
-def test_two_trainings_in_one_folder(whole):
-    shutil.rmtree(whole.folder / "runs/seed7")
-    with MetricsFile(whole.folder / "runs/seed6"):
-        code, _, error = whole("--resume", "runs")
+def test_two_trainings_in_one_folder(copied):
+    with MetricsFile(copied.folder / "runs/seed5"):
+        code, _, error = copied("--resume", "runs")
     assert code == 1
     assert "another training is writing into this folder" in error
     assert error.endswith("; continue with: python -m train.ppo --resume runs\n")
