@@ -78,11 +78,8 @@ def open_run(argv: Sequence[str]) -> AbstractContextManager[Run | Seeds]:
     if not options.resume:
         if options.scenario:
             options = _parse(on_scenario(from_dict(values), options.scenario), rest)
-        return (
-            start_run(_config(options))
-            if options.seeds == 1
-            else start_seeds(_config(options), options.seeds)
-        )
+        config = _config(options)
+        return start_run(config) if options.seeds == 1 else start_seeds(config, options.seeds)
     for name, given in (("config", values), ("scenario", options.scenario)):
         if given:
             raise ValueError(f"{name}: expected none beside --resume, which takes the run's own")
