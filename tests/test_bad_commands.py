@@ -35,7 +35,7 @@ def ended(folder, monkeypatch, capsys):
     def begin(*arguments, **named):
         raise SystemExit(ACCEPTED)
 
-    def start_run(config):
+    def start_run(config, *number):
         check(config)
         begin()
 
@@ -44,6 +44,7 @@ def ended(folder, monkeypatch, capsys):
     monkeypatch.setattr(render, "draw", begin)
     monkeypatch.setattr(evaluate, "play", begin)
     monkeypatch.setattr(ppo, "start_run", start_run)
+    monkeypatch.setattr(ppo, "start_seeds", start_run)
 
     def end(command, argv):
         monkeypatch.setattr("sys.argv", [command.__name__, *argv])
@@ -68,6 +69,7 @@ OPTIONS = {
         *[
             "--encoder",
             "--seed",
+            "--seeds",
             "--out",
             "--resume",
             "--config",

@@ -30,6 +30,7 @@ from train.episodes import Comparison, Competitor, compare, rule
 from train.results import Summary, print_results, summarise, write_results
 from train.saved_run import load_run
 from train.scenarios import build_scenario
+from train.seeds import run_folders
 
 COMPARED_SEED = 1_000_000
 """Seed of the scenarios on which policies are compared, far from the seeds of training."""
@@ -52,7 +53,8 @@ class EvaluateOptions:
     sweep, or "all";
     and of planners: greedy, rollout, uncertainty, or "planners". No name after the option for none."""
     runs: Annotated[tuple[Path, ...], tyro.conf.arg(aliases=["--run"])] = ()
-    """Folders of trained runs; runs that differ in nothing but their seed are one policy."""
+    """Folders of trained runs, or of several seeds; runs that differ in nothing but their seed are one
+    policy."""
     episodes: int = 100
     """Number of scenarios."""
     seed: int = COMPARED_SEED
@@ -73,7 +75,8 @@ def main(argv: Sequence[str]) -> int:
     """The command."""
     options = parse(EvaluateOptions(), argv, "python -m train.evaluate")
     check(options)
-    runs = [(folder, *load_run(folder)) for folder in options.runs]
+    folders = [folder for given in options.runs for folder in run_folders(given)]
+    runs = [(folder, *load_run(folder)) for folder in folders]
     env, params = build_scenario(options.scenario, [config for _, config, _, _ in runs])
     for folder, config, _, _ in runs:
         check_shapes(folder, config, env.static)

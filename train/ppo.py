@@ -1,36 +1,32 @@
 """The main job: `python -m train.ppo` trains an agent, evaluates it, and draws what it learned."""
 
 import dataclasses
-import math
 import shlex
 import sys
 import time
 from collections.abc import Sequence
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Any
 
 import jax
 from rich.console import Console
-from rich.progress import Progress
 
 from jaxtrack.cli import INTERRUPTED, parse, run, take_config, wide_console
 from jaxtrack.env import SearchTrack, make
 from jaxtrack.scenarios import read_scenario
-from train import learner
-from train.checkpoint import learner_shapes
 from train.config import TrainConfig, from_dict
-from train.display import columns, note, print_config, say_now_and_then
+from train.display import TrainingBar, print_config
 from train.evaluate import COMPARED_SEED, agent, compare_with_baselines
 from train.interrupt import Interrupt, exit_code
 from train.learner import LearnerState
+from train.loop import FAILED, compile_training, first_state, train
 from train.results import print_results, summarise, write_results
 from train.run_folder import Run, require_unchanged, resume_run, start_run
 from train.saved_run import read_config
+from train.seeds import Seeds, holds_seeds, read_seeds, start_seeds
 
-FAILED = 1
-LOST = "training diverged: {name} is {value} after update {update}"
-NOT_SAVED = ("resume", "scenario")
+NOT_SAVED = ("seeds", "resume", "scenario")
 """Options that are no part of a run's configuration: what a scenario sets stands there as fields."""
 PROG = "python -m train.ppo"
 HELP = (
@@ -44,8 +40,12 @@ HELP = (
 class Options(TrainConfig):
     """A new training, or the folder of one to continue."""
 
+    seeds: int = 1
+    """Number of trainings, one after the other in one program, with the seeds from --seed on. Each has
+    its own folder in --out, as if it were alone; at the end all are evaluated together."""
     resume: str = ""
-    """Folder of an interrupted run to continue; beside it only --evaluation-episodes may be given."""
+    """Folder of an interrupted run, or of several seeds, to continue; beside it only
+    --evaluation-episodes may be given."""
     scenario: str = ""
     """Scenario by name (paper, clutter, births, agile, turning, accelerating, crowd, swarm, slow, flying), or
     a .toml or .json file with fields of Params and StaticParams. It sets the defaults of these below."""
@@ -62,7 +62,7 @@ def main(argv: Sequence[str]) -> int:
             if run.finished:
                 console.print(f"{run.folder}: the training had finished, nothing is left to do")
                 return 0
-            return execute(run, console)
+            return execute_seeds(run, console) if isinstance(run, Seeds) else execute(run, console)
     except OSError as error:  # disk full, folder gone or read-only, another training in it
         print(f"error: {error}{advice}", file=sys.stderr)
         return FAILED
@@ -71,22 +71,37 @@ def main(argv: Sequence[str]) -> int:
         return INTERRUPTED
 
 
-def open_run(argv: Sequence[str]) -> AbstractContextManager[Run]:
-    """The run that the arguments ask for, not yet opened."""
+def open_run(argv: Sequence[str]) -> AbstractContextManager[Run | Seeds]:
+    """The run that the arguments ask for, or the runs of several seeds, not yet opened."""
     values, rest = take_config(argv)
     options = _parse(from_dict(values), rest)
     if not options.resume:
         if options.scenario:
             options = _parse(on_scenario(from_dict(values), options.scenario), rest)
-        return start_run(_config(options))
+        config = _config(options)
+        return start_run(config) if options.seeds == 1 else start_seeds(config, options.seeds)
     for name, given in (("config", values), ("scenario", options.scenario)):
         if given:
             raise ValueError(f"{name}: expected none beside --resume, which takes the run's own")
-    folder = Path(options.resume)
-    own, _ = read_config(folder)
-    wanted = _config(_parse(own, rest))
+    return open_again(Path(options.resume), rest)
+
+
+def open_again(folder: Path, argv: Sequence[str]) -> AbstractContextManager[Run | Seeds]:
+    """The run of a folder, or the runs of several seeds, that the arguments want to continue.
+
+    Raises:
+        ValueError: one line, if there is none, or if the arguments would change it.
+    """
+    several = read_seeds(folder) if holds_seeds(folder) else None
+    own, number = (several.config, several.number) if several else (read_config(folder)[0], 1)
+    options = _parse(own, argv, number)
+    wanted = _config(options)
+    if options.seeds != number:
+        raise ValueError(f"seeds = {options.seeds}: expected {number} as in the run")
     require_unchanged(own, wanted)
-    return resume_run(folder, wanted.evaluation_episodes)
+    if several is None:
+        return resume_run(folder, wanted.evaluation_episodes)
+    return nullcontext(dataclasses.replace(several, evaluation_episodes=wanted.evaluation_episodes))
 
 
 def on_scenario(config: TrainConfig, name: str) -> TrainConfig:
@@ -102,8 +117,8 @@ def on_scenario(config: TrainConfig, name: str) -> TrainConfig:
     return dataclasses.replace(config, static=env.static, params=params)
 
 
-def _parse(config: TrainConfig, argv: Sequence[str]) -> Options:
-    return parse(Options(**vars(config)), argv, PROG, HELP)
+def _parse(config: TrainConfig, argv: Sequence[str], seeds: int = 1) -> Options:
+    return parse(Options(**vars(config), seeds=seeds), argv, PROG, HELP)
 
 
 def _config(options: Options) -> TrainConfig:
@@ -113,117 +128,98 @@ def _config(options: Options) -> TrainConfig:
 def execute(run: Run, console: Console) -> int:
     """Trains, as far as that was not done before, and evaluates; returns the exit code."""
     code = 0
-    with Interrupt(f"continue with: {run.resume_command}") as interrupt:
+    env, _ = make(run.config.params, run.config.static)
+    with (
+        Interrupt(f"continue with: {run.resume_command}") as interrupt,
+        TrainingBar(run.config, console) as bar,
+    ):
         print_config(run.config, run.folder, console)
-        env, _ = make(run.config.params, run.config.static)
-        if run.trained:
+        if run.state is not None and run.trained:
             console.print("the training had finished, what follows it had not")
-            state = first_state(run, env)
+            state = run.state
         else:
-            state, compiled = compile_training(run, env, console)
-            state, code = train(state, compiled, run, interrupt, console)
+            programs = compile_training(run, env, console)
+            bar.begin("training", done=run.done)
+            state, code = train(first_state(run, programs), programs, run, interrupt, bar)
     if code == 0 and run.evaluation_episodes:
         finish(state, env, run, console)
     return code
 
 
-def first_state(run: Run, env: SearchTrack) -> LearnerState:
-    """The learner state of the run's checkpoint, or a fresh one."""
-    if run.state is not None:
-        return run.state
-    init = jax.jit(lambda key, params: learner.init_learner(key, params, env, run.config))
-    return init(jax.random.key(run.config.seed), run.config.params)
-
-
-def compile_training(run: Run, env: SearchTrack, console: Console) -> tuple[LearnerState, Any]:
-    """First learner state and the compiled training step; says how long compiling took."""
-    started = time.perf_counter()
-    with console.status("compiling (about half a minute)"):
-        state = first_state(run, env)
-        step = jax.jit(lambda state: learner.train_step(state, env, run.config), donate_argnums=0)
-        # From shapes alone, so that a resumed run compiles the very same program.
-        compiled = step.lower(learner_shapes(env, run.config)).compile()
-    console.print(f"compiled in {time.perf_counter() - started:.1f} s")
-    return state, compiled
-
-
-def train(
-    state: LearnerState, compiled: Any, run: Run, interrupt: Interrupt, console: Console
-) -> tuple[LearnerState, int]:
-    """Runs the updates that are left; one row of metrics each, a checkpoint now and then and at the end."""
-    config, code = run.config, 0
-    saved = run.done or None
-    started = time.perf_counter() - run.metrics.seconds
-    with Progress(*columns(), console=console, disable=not console.is_terminal) as progress:
-        task = progress.add_task("training", total=config.num_updates * config.batch_size, note="")
-        for update in range(run.done + 1, config.num_updates + 1):
-            state, metrics = compiled(state)
-            row = make_row(jax.device_get(metrics), update, time.perf_counter() - started, run)
-            lost = next((name for name in HEALTH if not math.isfinite(row[name])), None)
-            if lost:
-                console.print(LOST.format(name=lost, value=row[lost], update=update))
-                code = FAILED
-                break
-            run.metrics.write(row)
-            progress.update(task, completed=row["env_steps"], note=note(row))
-            say_now_and_then(update, row, config, console)
-            passed = run.passed
-            last = interrupt.signal or passed or update == config.num_updates
-            if last or update % config.checkpoint_every == 0:
-                run.save(state)
-                saved = update
-            if passed:
-                console.print(f"ended after update {update}: {passed}")
+def execute_seeds(seeds: Seeds, console: Console) -> int:
+    """Trains the seeds that are left, one after the other, and evaluates all together; the exit code."""
+    weights: dict[int, Any] = {}
+    programs, code = None, 0
+    env, _ = make(seeds.config.params, seeds.config.static)
+    with (
+        Interrupt(f"continue with: {seeds.resume_command}") as interrupt,
+        TrainingBar(seeds.config, console, seeds.number) as bar,
+    ):
+        print_config(seeds.config, seeds.folder, console)
+        for place, seed in enumerate(seeds.seeds):
+            with seeds.open(seed) as run:
+                state, code = run.state, 0
+                if state is None or not run.trained:
+                    programs = programs or compile_training(run, env, console)
+                    name = f"seed {seed} ({place + 1} of {seeds.number})"
+                    console.print(f"{name}: {run.folder}")
+                    bar.begin(name, place, run.done)
+                    state, code = train(first_state(run, programs), programs, run, interrupt, bar)
             if interrupt.signal:
-                code = exit_code(interrupt.signal)
-            if last:
-                break
-    if code:
-        say_stopped(update, saved, run, code)
-    return state, code
+                if not code:  # it came between two trainings
+                    print(f"continue with: {seeds.resume_command}")
+                return exit_code(interrupt.signal)
+            if code == 0:
+                weights[seed] = state.weights
+        if programs is None:
+            left = "what follows it had not" if seeds.evaluation_episodes else "nothing is left to do"
+            console.print(f"the training had finished, {left}")
+    return finish_seeds(weights, env, seeds, console)
 
 
-def say_stopped(update: int, saved: int | None, run: Run, code: int) -> None:
-    """Says what is left of a training that did not reach its end; not wrapped, so that it can be copied."""
-    if saved is None:
-        print(f"stopped after {update} updates; no checkpoint yet in {run.folder}, so nothing to evaluate")
-        return
-    print(f"stopped after {update} updates; checkpoint of update {saved} in {run.folder}")
-    if code != FAILED:
-        print(f"continue with: {run.resume_command}")
-    print(f"evaluate it with: python -m train.evaluate --run {shlex.quote(str(run.folder))}")
-
-
-HEALTH = ("policy_loss", "value_loss", "gradient_norm", "reward")
-"""Metrics that end the training when they are not finite."""
-
-
-def make_row(metrics: dict[str, Any], update: int, seconds: float, run: Run) -> dict[str, float]:
-    """One row of metrics.csv; the clock's columns span all parts of a resumed training that have rows."""
-    batch = run.config.batch_size
-    speed = (update - run.metrics.lost) * batch / seconds
-    clock = {"update": update, "env_steps": update * batch, "seconds": seconds, "steps_per_second": speed}
-    return {**clock, **{name: float(value) for name, value in metrics.items()}}
+def finish_seeds(weights: dict[int, Any], env: SearchTrack, seeds: Seeds, console: Console) -> int:
+    """Evaluates all seeds together, if all were trained to their end; returns the exit code."""
+    failed = [str(seed) for seed in seeds.seeds if seed not in weights]
+    if failed:
+        print(f"not all were trained to their end, so nothing is compared; missing: seed {', '.join(failed)}")
+        if weights:
+            runs = shlex.join(str(seeds.folder / f"seed{seed}") for seed in weights)
+            print(f"evaluate the others with: python -m train.evaluate --runs {runs}")
+        return FAILED
+    if seeds.evaluation_episodes:
+        evaluate_agent(weights, env, seeds, seeds.folders, console)
+    return 0
 
 
 def finish(state: LearnerState, env: SearchTrack, run: Run, console: Console) -> None:
     """Evaluates the trained agent against the baselines; draws pictures and writes tables."""
+    evaluate_agent({run.config.seed: state.weights}, env, run, [run.folder], console)
+
+
+def evaluate_agent(
+    weights: dict[int, Any], env: SearchTrack, trained: Run | Seeds, folders: Sequence[Path], console: Console
+) -> None:
+    """Evaluates an agent, by its weights of every seed, against the baselines.
+
+    Learning curves go into the folders of the seeds, all else into that of what was trained.
+    """
     from jaxtrack.recording import record_episode
     from jaxtrack.render import animate
     from train import figures, plots
 
     started = time.perf_counter()
-    config, folder = run.config, run.folder
-    competitor = agent(config, [state.weights], (config.seed,))
+    config, folder = trained.config, trained.folder
+    competitor = agent(config, list(weights.values()), tuple(weights))
     comparison = compare_with_baselines(
-        config.encoder, competitor, env, config.params, run.evaluation_episodes, COMPARED_SEED, console
+        config.encoder, competitor, env, config.params, trained.evaluation_episodes, COMPARED_SEED, console
     )
     summary = summarise(comparison.played)
     print_results(comparison, summary, [config.encoder], console)
     console.print(f"evaluated in {time.perf_counter() - started:.1f} s")
-    plots.learning_curve(folder / "metrics.csv", folder / "learning_curve.png")
+    for own in folders:
+        plots.learning_curve(own / "metrics.csv", own / "learning_curve.png")
     drawn = figures.draw_all(comparison.played, summary, config.params, folder)
-    policy = competitor.build(state.weights)(env.static, config.params)
+    policy = competitor.build(competitor.weights[0])(env.static, config.params)
     episode = record_episode(env, config.params, policy, jax.random.key(COMPARED_SEED))
     animate(episode, folder / "episode.gif", progress=console.is_terminal)
     write_results(comparison, summary, env, config.params, COMPARED_SEED, folder)

@@ -191,12 +191,22 @@ def print_results(comparison: Comparison, summary: Summary, agents: list[str], c
         f"compiled in {comparison.compile_seconds:.1f} s; played {number} episodes in "
         f"{comparison.play_seconds:.1f} s ({number / comparison.play_seconds:.1f} episodes/s)"
     )
+    for name, one in comparison.played.items():
+        if len(one.seeds) > 1:
+            console.print(say_seeds(name, one))
     for (agent, other), by_metric in summary.differences.items():
         if agent in agents:
             value, low, high = by_metric["gospa"]
             console.print(
                 f"GOSPA of {agent} minus {other}: {value:+.1f} m, 95 % interval [{low:+.1f}, {high:+.1f}]"
             )
+
+
+def say_seeds(name: str, played: Played) -> str:
+    """How far the trainings of an agent lie apart, of which the intervals over scenarios say nothing."""
+    means = statistics.seed_means(played.values["gospa"])
+    each = ", ".join(f"{seed}: {mean:.1f}" for seed, mean in zip(played.seeds, means, strict=True))
+    return f"GOSPA of {name} by training seed: {each} m; standard deviation {np.std(means, ddof=1):.1f} m"
 
 
 def format_estimate(estimate: Estimate) -> str:

@@ -29,6 +29,7 @@ class Run:
         metrics: the open metrics.csv.
         done: updates that its checkpoint has behind it.
         state: the learner state of the checkpoint; None at the start.
+        belongs_to: the folder of several seeds, if it is trained as one of them.
     """
 
     folder: Path
@@ -37,11 +38,12 @@ class Run:
     metrics: MetricsFile
     done: int = 0
     state: LearnerState | None = None
+    belongs_to: Path | None = None
 
     @property
     def resume_command(self) -> str:
-        """What continues it."""
-        return f"python -m train.ppo --resume {shlex.quote(str(self.folder))}"
+        """What continues it, and the other seeds."""
+        return resume_command(self.belongs_to or self.folder)
 
     @property
     def trained(self) -> bool:
@@ -66,6 +68,11 @@ class Run:
         """Writes a checkpoint; what metrics.csv tells of the way to it is on the disk before."""
         self.metrics.sync()
         save(self.folder, state, self.config, self.metrics.digest)
+
+
+def resume_command(folder: Path) -> str:
+    """What continues the training in a folder."""
+    return f"python -m train.ppo --resume {shlex.quote(str(folder))}"
 
 
 @contextlib.contextmanager

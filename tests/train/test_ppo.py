@@ -37,9 +37,8 @@ def whole(tmp_path_factory):
     compile_training = ppo.compile_training
 
     def compile_and_keep(*arguments):
-        state, compiled = compile_training(*arguments)
-        kept.append((jax.device_get(state), compiled))
-        return state, compiled
+        kept.append(compile_training(*arguments))
+        return kept[-1]
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(ppo, "compile_training", compile_and_keep)
@@ -110,13 +109,9 @@ def test_a_whole_run_can_be_evaluated_again(whole, tmp_path, capsys):
 def go(whole, monkeypatch):
     """Runs the command on what the whole run compiled; gives the exit code."""
 
-    def command(*arguments, compiled=whole[2][1]):
-        def compile_nothing(run, env, console):
-            state = run.state or jax.device_put(whole[2][0])
-            return state, compiled
-
+    def command(*arguments, step=whole[2].step):
         with monkeypatch.context() as patch:
-            patch.setattr(ppo, "compile_training", compile_nothing)
+            patch.setattr(ppo, "compile_training", lambda *_: whole[2]._replace(step=step))
             return ppo.main(list(map(str, arguments)))
 
     return command
@@ -182,7 +177,7 @@ def test_a_resumed_training_ends_as_if_it_had_never_stopped(whole, start, go, st
 def test_a_training_without_a_checkpoint_starts_anew(whole, start, go, tmp_path, capsys):
     folder = tmp_path / "run"
     with pytest.raises(SystemExit):
-        start(folder, compiled=stopping(whole[2][1], at=1))
+        start(folder, step=stopping(whole[2].step, at=1))
     assert checkpoints(folder) == []
     assert len(read_rows(folder)) == 1
     assert go("--resume", folder) == 0
@@ -190,15 +185,15 @@ def test_a_training_without_a_checkpoint_starts_anew(whole, start, go, tmp_path,
     assert_same_result(folder, whole[0])
 
 
-def stopping(compiled, at):
+def stopping(step, at):
     """A training step that ends the process after some updates, as a kill would."""
 
-    def step(state):
+    def step_or_stop(state):
         if int(state.update) == at:
             raise SystemExit
-        return compiled(state)
+        return step(state)
 
-    return step
+    return step_or_stop
 
 
 def test_a_finished_training_says_so(whole, go, capsys):
@@ -231,14 +226,12 @@ def test_a_stopped_evaluation_says_how_to_continue(start, go, tmp_path, monkeypa
 
 
 def test_a_training_that_diverges_says_so_and_keeps_the_last_good_checkpoint(whole, start, tmp_path, capsys):
-    _, compiled = whole[2]
-
     def diverging(state):
-        after, metrics = compiled(state)
+        after, metrics = whole[2].step(state)
         return after, {**metrics, "value_loss": np.where(after.update == 3, np.nan, metrics["value_loss"])}
 
     folder = tmp_path / "run"
-    assert start(folder, compiled=diverging) == 1
+    assert start(folder, step=diverging) == 1
     said = " ".join(capsys.readouterr().out.split())
     assert "training diverged: value_loss is nan after update 3" in said
     assert "checkpoint of update 2 in" in said
@@ -246,14 +239,12 @@ def test_a_training_that_diverges_says_so_and_keeps_the_last_good_checkpoint(who
 
 
 def test_without_a_checkpoint_there_is_nothing_to_evaluate(whole, start, tmp_path, capsys):
-    _, compiled = whole[2]
-
     def diverging(state):
-        after, metrics = compiled(state)
+        after, metrics = whole[2].step(state)
         return after, {**metrics, "value_loss": np.float32(np.nan)}
 
     folder = tmp_path / "run"
-    assert start(folder, compiled=diverging) == 1
+    assert start(folder, step=diverging) == 1
     said = " ".join(capsys.readouterr().out.split())
     assert "stopped after 1 updates; no checkpoint yet in" in said
     assert "nothing to evaluate" in said
@@ -264,6 +255,43 @@ def test_without_a_checkpoint_there_is_nothing_to_evaluate(whole, start, tmp_pat
 def test_the_same_seed_gives_the_same_numbers(whole, start, tmp_path):
     assert start(tmp_path / "run") == 0
     assert_same_result(tmp_path / "run", whole[0])
+
+
+def test_a_seed_among_several_ends_as_it_does_alone(whole, start, tmp_path):
+    assert start(tmp_path / "several", "--seeds", 2) == 0
+    assert_same_result(tmp_path / "several/seed0", whole[0])
+    assert start(tmp_path / "alone", "--seed", 1) == 0
+    assert_same_result(tmp_path / "several/seed1", tmp_path / "alone")
+    assert read_rows(tmp_path / "alone")[0]["reward"] != read_rows(whole[0])[0]["reward"]
+
+
+@pytest.mark.slow
+def test_several_seeds_are_compiled_once_and_compared_once(whole, tmp_path, capsys):
+    """With a program of their own: that of the first seed serves the second."""
+    folder = tmp_path / "runs"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(evaluate, "POLICIES", BASELINES)
+        assert ppo.main([*SMALL, "--seed", "1", "--seeds", "2", "--out", str(folder)]) == 0
+        assert ppo.main([*SMALL, "--seed", "2", "--out", str(tmp_path / "alone")]) == 0
+        assert ppo.main(["--resume", str(folder)]) == 0
+        assert evaluate.main(["--run", str(folder), "--episodes", "2", "--out", str(tmp_path / "again")]) == 0
+    said = capsys.readouterr().out
+    assert said.count("compiled in") == 2 + 3  # by two trainings and three comparisons
+    assert "nothing is left to do" in said
+    assert_same_result(folder / "seed2", tmp_path / "alone")
+    assert all((folder / name).stat().st_size > 1000 for name in PICTURES if name != "learning_curve.png")
+    assert sorted(path.name for path in (folder / "seed2").iterdir()) == [
+        "checkpoints",
+        "config.json",
+        "learning_curve.png",
+        "metrics.csv",
+    ]
+    results, again = (
+        json.loads((each / "results.json").read_text()) for each in (folder, tmp_path / "again")
+    )
+    assert results["policies"]["beams"]["training_seeds"] == [1, 2]
+    gospa = [each["policies"]["beams"]["metrics"]["gospa"]["by_training_seed"] for each in (results, again)]
+    np.testing.assert_allclose(*gospa, rtol=1e-4)
 
 
 @pytest.mark.parametrize(

@@ -94,6 +94,8 @@ def test_the_table_shows_every_policy_the_speed_and_the_paired_differences(summa
     assert "compiled in 2.0 s; played 16 episodes in 4.0 s (4.0 episodes/s)" in said
     assert "GOSPA of own minus random: -1.0 m, 95 % interval [-1.0, -1.0]" in said
     assert "GOSPA of random minus" not in said
+    assert "GOSPA of own by training seed: 0: 3.0, 7: 5.0 m; standard deviation 1.4 m" in said
+    assert said.count("by training seed") == 1
 
 
 def test_numbers_have_the_digits_that_are_worth_reading():

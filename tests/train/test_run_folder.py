@@ -24,6 +24,7 @@ from tests.train.small_run import (
 from train import ppo, run_folder
 from train.checkpoint import load_newest, updates
 from train.config import to_dict
+from train.loop import Programs
 from train.metrics_file import MetricsFile
 from train.run_folder import resume_run
 
@@ -40,11 +41,8 @@ def train(state, tmp_path, monkeypatch, capsys):
     (tmp_path / "config.json").write_text(json.dumps(to_dict(CONFIG)))
 
     def command(*arguments, step=step):
-        def compile_nothing(run, env, console):
-            return run.state or state, step
-
         with monkeypatch.context() as patch:
-            patch.setattr(ppo, "compile_training", compile_nothing)
+            patch.setattr(ppo, "compile_training", lambda *_: Programs(lambda *_: state, step))
             patch.setattr("sys.argv", ["ppo", *map(str, arguments)])
             with pytest.raises(SystemExit) as stop:
                 run(ppo.main)
