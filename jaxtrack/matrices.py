@@ -4,10 +4,12 @@ The batch comes last, so that neighbouring numbers take the same operations, and
 written out: for matrices this small, calling a library costs more than the arithmetic.
 """
 
+import functools
+
 import jax
 import jax.numpy as jnp
 
-from jaxtrack.kernel import add_up
+from jaxtrack.kernel import add_up, stage
 
 
 def cholesky(matrix: jax.Array) -> jax.Array:
@@ -22,6 +24,44 @@ def cholesky(matrix: jax.Array) -> jax.Array:
         columns.append(reduced / jnp.sqrt(reduced[0]))
     above = [jnp.zeros_like(matrix[:k, 0]) for k in range(matrix.shape[0])]
     return jnp.stack([jnp.concatenate(pair) for pair in zip(above, columns, strict=True)], axis=1)
+
+
+def triangular_factor(matrix: jax.Array) -> jax.Array:
+    """Lower triangular L `[n, n, ...]` with ``L L^T = A A^T`` for matrices A `[n, m, ...]`, m >= n.
+
+    By Householder reflections, without the product A A^T: small numbers beside large ones are kept where a
+    Cholesky factor of the product would lose them. No diagonal of L is negative.
+    """
+    columns: list[jax.Array] = []
+    for j in range(matrix.shape[0]):
+        matrix = _reflect(matrix)
+        columns.append(jnp.concatenate([jnp.zeros((j, *matrix.shape[2:]), matrix.dtype), matrix[:, 0]]))
+        matrix = matrix[1:, 1:]
+    return jnp.stack(columns, axis=1)
+
+
+@stage
+def _reflect(matrix: jax.Array) -> jax.Array:
+    """Matrices A `[n, m, ...]` times a reflection, of whose first rows one number >= 0 is left."""
+    first = matrix[0]
+    # Scaled, so that no square is too large or too small.
+    largest = functools.reduce(jnp.maximum, jnp.unstack(jnp.abs(first)))
+    first = first / jnp.where(largest == 0, 1, largest)
+    length = jnp.sqrt(add_up(first * first))
+    mirror = jnp.concatenate([first[:1] + jnp.copysign(length, first[:1]), first[1:]])
+    half_square = length * (length + jnp.abs(first[0]))
+    along = add_up(matrix * mirror, axis=1) / jnp.where(half_square == 0, 1, half_square)
+    turned = matrix - along[:, None] * mirror
+    return jnp.concatenate([-jnp.copysign(1, first[0]) * turned[:, :1], turned[:, 1:]], axis=1)
+
+
+def solve_lower(factor: jax.Array, vector: jax.Array) -> jax.Array:
+    """``L^-1 b`` `[n, ...]` of lower triangular L `[n, n, ...]` and b `[n, ...]`, by substitution."""
+    solved: list[jax.Array] = []
+    for row, entry in zip(factor, vector, strict=True):
+        rest = entry - sum(a * b for a, b in zip(row, solved, strict=False))
+        solved.append(rest / row[len(solved)])
+    return jnp.stack(solved)
 
 
 def inverse_3x3(matrix: jax.Array) -> jax.Array:
