@@ -9,7 +9,7 @@ import functools
 import jax
 import jax.numpy as jnp
 
-from jaxtrack.kernel import add_up, stage
+from jaxtrack.kernel import add_up
 
 
 def cholesky(matrix: jax.Array) -> jax.Array:
@@ -32,27 +32,30 @@ def triangular_factor(matrix: jax.Array) -> jax.Array:
     By Householder reflections, without the product A A^T: small numbers beside large ones are kept where a
     Cholesky factor of the product would lose them. No diagonal of L is negative.
     """
-    columns: list[jax.Array] = []
-    for j in range(matrix.shape[0]):
-        matrix = _reflect(matrix)
-        columns.append(jnp.concatenate([jnp.zeros((j, *matrix.shape[2:]), matrix.dtype), matrix[:, 0]]))
-        matrix = matrix[1:, 1:]
-    return jnp.stack(columns, axis=1)
+    size = matrix.shape[0]
+    # In a loop: written out, XLA takes minutes.
+    reflected = jax.lax.fori_loop(0, size, _reflect, matrix)[:, :size]
+    lower = jnp.tril(jnp.ones((size, size), bool)).reshape(size, size, *(1 for _ in matrix.shape[2:]))
+    return jnp.where(lower, reflected, 0)
 
 
-@stage
-def _reflect(matrix: jax.Array) -> jax.Array:
-    """Matrices A `[n, m, ...]` times a reflection, of whose first rows one number >= 0 is left."""
-    first = matrix[0]
+def _reflect(j: jax.Array, matrix: jax.Array) -> jax.Array:
+    """Matrices A `[n, m, ...]` times a reflection after which row j is zero from column j + 1 on.
+
+    Rows before j have had their turn, and are not changed.
+    """
+    column = jnp.arange(matrix.shape[1]).reshape(-1, *(1 for _ in matrix.shape[2:]))
+    row = jnp.where(column >= j, jax.lax.dynamic_index_in_dim(matrix, j, keepdims=False), 0)
     # Scaled, so that no square is too large or too small.
-    largest = functools.reduce(jnp.maximum, jnp.unstack(jnp.abs(first)))
-    first = first / jnp.where(largest == 0, 1, largest)
-    length = jnp.sqrt(add_up(first * first))
-    mirror = jnp.concatenate([first[:1] + jnp.copysign(length, first[:1]), first[1:]])
-    half_square = length * (length + jnp.abs(first[0]))
+    largest = functools.reduce(jnp.maximum, jnp.unstack(jnp.abs(row)))
+    row = row / jnp.where(largest == 0, 1, largest)
+    pivot = jax.lax.dynamic_index_in_dim(row, j)
+    length = jnp.sqrt(add_up(row * row))
+    mirror = jnp.where(column == j, pivot + jnp.copysign(length, pivot), row)
+    half_square = length * (length + jnp.abs(pivot[0]))
     along = add_up(matrix * mirror, axis=1) / jnp.where(half_square == 0, 1, half_square)
     turned = matrix - along[:, None] * mirror
-    return jnp.concatenate([-jnp.copysign(1, first[0]) * turned[:, :1], turned[:, 1:]], axis=1)
+    return jnp.where(column == j, -jnp.copysign(1, pivot) * turned, turned)
 
 
 def solve_lower(factor: jax.Array, vector: jax.Array) -> jax.Array:

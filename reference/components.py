@@ -29,17 +29,20 @@ from stonesoup.metricgenerator.ospametric import GOSPAMetric
 from stonesoup.models.measurement.linear import LinearGaussian
 from stonesoup.models.measurement.nonlinear import CartesianToElevationBearingRange
 from stonesoup.models.transition.linear import CombinedLinearGaussianTransitionModel, ConstantVelocity
-from stonesoup.predictor.kalman import KalmanPredictor
+from stonesoup.predictor.kalman import KalmanPredictor, SqrtKalmanPredictor
 from stonesoup.tracker.simple import MultiTargetTracker
 from stonesoup.types.angle import Bearing, Elevation
 from stonesoup.types.array import StateVector
 from stonesoup.types.detection import Detection
 from stonesoup.types.prediction import MeasurementPrediction
 from stonesoup.types.state import GaussianState, State
+from stonesoup.types.track import Track
+from stonesoup.types.update import SqrtGaussianStateUpdate
 from stonesoup.updater.kalman import (
     CubatureKalmanUpdater,
     ExtendedKalmanUpdater,
     KalmanUpdater,
+    SqrtKalmanUpdater,
     UnscentedKalmanUpdater,
 )
 
@@ -76,6 +79,14 @@ UPDATERS: dict[str, Callable[[Params], KalmanUpdater]] = {
 
 The last one needs detections that were converted to positions: `translate.to_position`.
 """
+
+SQUARE_ROOT_UPDATERS: dict[str, Callable[[Params], KalmanUpdater]] = {
+    "unscented": UPDATERS["unscented"],
+    "extended": lambda _: SqrtKalmanUpdater(measurement_model=None),
+    "cubature": lambda _: UnscentedKalmanUpdater(measurement_model=None, alpha=1.0, beta=0.0, kappa=0.0),
+    "converted": lambda _: SqrtKalmanUpdater(measurement_model=None, qr_method=True),
+}
+"""The same for `covariance_form` = square_root. Sigma points have no square-root updater in Stone Soup."""
 
 ASSOCIATORS: dict[str, type[DataAssociator]] = {
     "nearest_neighbour": NearestNeighbour,
@@ -162,6 +173,27 @@ class SharpCubatureKalmanUpdater(CubatureKalmanUpdater):
         )
 
 
+class SquareRootInitiator(SimpleMeasurementInitiator):
+    """The stock initiator, whose tracks begin in the form that `SqrtKalmanPredictor` asks for."""
+
+    def initiate(self, detections: set[Detection], timestamp: datetime.datetime, **kwargs: Any) -> set[Track]:
+        """As the stock one."""
+        states = [track.state for track in super().initiate(detections, timestamp, **kwargs)]
+        return {
+            Track(
+                [
+                    SqrtGaussianStateUpdate(
+                        state.state_vector,
+                        np.linalg.cholesky(state.covar),
+                        timestamp=state.timestamp,
+                        hypothesis=state.hypothesis,
+                    )
+                ]
+            )
+            for state in states
+        }
+
+
 @dataclass(frozen=True)
 class Components:
     """The parts of one tracker, each a stock Stone Soup object."""
@@ -198,8 +230,7 @@ def build_components(
         static: which components, by name.
     """
     model = measurement_model(params, exact_jacobian)
-    predictor = KalmanPredictor(transition_model(params.process_noise))
-    updater = UPDATERS[static.filter](params)
+    predictor, updater, first = build_filter(params, model, static)
     distance = MEASURES[static.measure]()
     hypothesiser = DistanceGater(
         DistanceHypothesiser(predictor, updater, distance, missed_distance=params.missed_distance),
@@ -208,7 +239,7 @@ def build_components(
     )
     associator = ASSOCIATORS[static.associator](hypothesiser)
     deleter = build_deleter(params, static)
-    initiator: Initiator = SimpleMeasurementInitiator(prior_state(params), model)
+    initiator: Initiator = first
     if static.initiator == "multi_measurement":
         initiator = MultiMeasurementInitiator(
             prior_state(params),
@@ -217,6 +248,7 @@ def build_components(
             updater=updater,
             measurement_model=model,
             min_points=static.min_points,
+            initiator=first,
         )
     return Components(
         measurement_model=model,
@@ -228,6 +260,21 @@ def build_components(
         initiator=initiator,
         deleter=deleter,
     )
+
+
+def build_filter(
+    params: Params, model: CartesianToElevationBearingRange, static: StaticParams
+) -> tuple[KalmanPredictor, KalmanUpdater, SimpleMeasurementInitiator]:
+    """Predictor and updater in the form asked for, and an initiator whose tracks have it."""
+    transition, prior = transition_model(params.process_noise), prior_state(params)
+    if static.covariance_form == "full":
+        updater = UPDATERS[static.filter](params)
+    else:
+        updater = SQUARE_ROOT_UPDATERS[static.filter](params)
+    if isinstance(updater, SqrtKalmanUpdater):
+        predictor = SqrtKalmanPredictor(transition, qr_method=True)
+        return predictor, updater, SquareRootInitiator(prior, model)
+    return KalmanPredictor(transition), updater, SimpleMeasurementInitiator(prior, model)
 
 
 def build_deleter(params: Params, static: StaticParams) -> Deleter:
