@@ -63,7 +63,7 @@ def test_inspecting():
 
 
 def test_errors_are_in_sigmas():
-    covariance = np.tile(np.diag([4.0, 1, 1, 1, 1, 9]), (1, 2, 1, 1, 1))[:, None]
+    covariance = np.tile(np.diag([4.0, 1, 1, 1, 1, 9]), (1, 1, 2, 1, 1))
     one = Estimates(np.zeros((1, 1, 2, 6)), covariance.copy())
     one.mean[0, 0, 0, 0], one.covariance[0, 0, 1, 0, 5] = 1.0, 3.0
     of_mean, of_covariance = errors(one, Estimates(np.zeros((1, 1, 2, 6)), covariance), 0)
