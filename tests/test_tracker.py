@@ -297,6 +297,7 @@ PARTS = [
     {"filter": "cubature", "associator": "global_nearest_neighbour"},
     {"filter": "converted", "deleters": ("update_time", "update_time_steps"), "intersect_deleters": True},
     {"initiator": "multi_measurement", "min_points": 1},
+    {"covariance_form": "square_root"},
 ]
 
 
@@ -306,7 +307,8 @@ def test_other_parts_keep_the_rules_of_a_step(parts, tracks, detections):
     """Types are kept, NaN in empty rows changes no bit, an empty look is only a prediction."""
     static, params = StaticParams(**parts), Params(deletion_time=1.0, deletion_steps=5)
     start = lifecycle.no_tracks(5, static)
-    more = {"counts": start.counts, "tentative": start.tentative}
+    root = None if start.root is None else jnp.linalg.cholesky(tracks.covariance)
+    more = {"counts": start.counts, "tentative": start.tentative, "root": root}
     scenes = [
         (tracks.replace(**more), detections),
         (poison(tracks).replace(**more), poison(detections)),
