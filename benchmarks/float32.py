@@ -47,7 +47,8 @@ class Soundness:
         not_finite: `[N]` which tracks have an estimate that is not finite.
         negative: `[N]` which have a variance below zero.
         smallest_variance: of the finite estimates (m^2 or m^2/s^2); NaN without any.
-        smallest_eigenvalue: of the finite covariances, in units of their traces; NaN without any.
+        smallest_eigenvalue: of the finite covariances, in units of their traces (of the sizes of the
+            variances, should one be negative); NaN without any.
     """
 
     not_finite: np.ndarray
@@ -68,11 +69,11 @@ class Soundness:
 def inspect(mean: ArrayLike, covariance: ArrayLike) -> Soundness:
     """Soundness of means `[K, N, 6]` and covariances `[K, N, 6, 6]`."""
     P = np.asarray(covariance, np.float64)
-    finite = np.isfinite(P).all(axis=(2, 3)) & np.isfinite(mean).all(axis=2)
+    finite = np.asarray(np.isfinite(P).all(axis=(2, 3)) & np.isfinite(mean).all(axis=2))
     variances = np.where(finite[..., None], np.diagonal(P, axis1=2, axis2=3), np.inf)
     held = P[finite]
-    with np.errstate(divide="ignore", invalid="ignore"):  # a trace of 0
-        relative = np.linalg.eigvalsh(held)[:, 0] / np.trace(held, axis1=1, axis2=2)
+    traces = np.abs(np.diagonal(held, axis1=1, axis2=2)).sum(axis=1)
+    relative = np.linalg.eigvalsh(held)[:, 0] / np.where(traces == 0, 1, traces)
     return Soundness(
         not_finite=~np.all(finite, axis=0),
         negative=np.any(variances < 0, axis=(0, 2)),

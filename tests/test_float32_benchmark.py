@@ -59,7 +59,7 @@ def test_inspecting():
     np.testing.assert_array_equal(sound.not_finite, [True, True, False, False])
     np.testing.assert_array_equal(sound.negative, [False, False, True, False])
     assert sound.smallest_variance == -2.0
-    assert sound.smallest_eigenvalue == pytest.approx(-2 / 3)
+    assert sound.smallest_eigenvalue == pytest.approx(-1 / 3)
 
 
 def test_errors_are_in_sigmas():
