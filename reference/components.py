@@ -12,11 +12,10 @@ from stonesoup.deleter import Deleter
 from stonesoup.deleter.error import CovarianceBasedDeleter
 from stonesoup.deleter.multi import CompositeDeleter
 from stonesoup.deleter.time import UpdateTimeDeleter, UpdateTimeStepsDeleter
-from stonesoup.functions import gauss2cubature
 from stonesoup.gater.distance import DistanceGater
 from stonesoup.hypothesiser.distance import DistanceHypothesiser
 from stonesoup.initiator import Initiator
-from stonesoup.initiator.simple import MultiMeasurementInitiator, SimpleMeasurementInitiator
+from stonesoup.initiator.simple import MultiMeasurementInitiator
 from stonesoup.measures import Euclidean, Mahalanobis
 from stonesoup.measures.state import (
     GaussianHellinger,
@@ -29,26 +28,18 @@ from stonesoup.metricgenerator.ospametric import GOSPAMetric
 from stonesoup.models.measurement.linear import LinearGaussian
 from stonesoup.models.measurement.nonlinear import CartesianToElevationBearingRange
 from stonesoup.models.transition.linear import CombinedLinearGaussianTransitionModel, ConstantVelocity
-from stonesoup.predictor.kalman import KalmanPredictor, SqrtKalmanPredictor
+from stonesoup.predictor.kalman import KalmanPredictor
 from stonesoup.tracker.simple import MultiTargetTracker
-from stonesoup.types.angle import Bearing, Elevation
-from stonesoup.types.array import StateVector
 from stonesoup.types.detection import Detection
-from stonesoup.types.prediction import MeasurementPrediction
 from stonesoup.types.state import GaussianState, State
-from stonesoup.types.track import Track
-from stonesoup.types.update import SqrtGaussianStateUpdate
 from stonesoup.updater.kalman import (
-    CubatureKalmanUpdater,
-    ExtendedKalmanUpdater,
     KalmanUpdater,
-    SqrtKalmanUpdater,
-    UnscentedKalmanUpdater,
 )
 
 from jaxtrack.params import Params, StaticParams
 from jaxtrack.tracker import DEFAULT
 from jaxtrack.types import POSITION, STATE_DIM, VELOCITY
+from reference.filters import build_filter
 
 EPOCH = datetime.datetime(2000, 1, 1)
 """Time of step 0."""
@@ -66,27 +57,6 @@ MEASURES: dict[str, type[Measure]] = {
 The last three need detections that carry their own covariance (`GaussianDetection`): with a
 plain `Detection` they fail for want of one.
 """
-
-UPDATERS: dict[str, Callable[[Params], KalmanUpdater]] = {
-    "unscented": lambda params: UnscentedKalmanUpdater(
-        measurement_model=None, alpha=params.alpha, beta=params.beta, kappa=params.kappa
-    ),
-    "extended": lambda _: ExtendedKalmanUpdater(measurement_model=None),
-    "cubature": lambda _: SharpCubatureKalmanUpdater(measurement_model=None),
-    "converted": lambda _: KalmanUpdater(measurement_model=None),
-}
-"""Stock updaters by the names of `jaxtrack.kalman.FILTERS`.
-
-The last one needs detections that were converted to positions: `translate.to_position`.
-"""
-
-SQUARE_ROOT_UPDATERS: dict[str, Callable[[Params], KalmanUpdater]] = {
-    "unscented": UPDATERS["unscented"],
-    "extended": lambda _: SqrtKalmanUpdater(measurement_model=None),
-    "cubature": lambda _: UnscentedKalmanUpdater(measurement_model=None, alpha=1.0, beta=0.0, kappa=0.0),
-    "converted": lambda _: SqrtKalmanUpdater(measurement_model=None, qr_method=True),
-}
-"""The same for `covariance_form` = square_root. Sigma points have no square-root updater in Stone Soup."""
 
 ASSOCIATORS: dict[str, type[DataAssociator]] = {
     "nearest_neighbour": NearestNeighbour,
@@ -139,61 +109,6 @@ class ExactCartesianToElevationBearingRange(CartesianToElevationBearingRange):
         return jacobian
 
 
-class SharpCubatureKalmanUpdater(CubatureKalmanUpdater):
-    """The stock updater, but for its rounding: the same formulas in extended precision, radar at the origin.
-
-    It forms products of coordinates, as large as the square of a range, and what is left of their
-    difference is as small as a variance.
-    """
-
-    def predict_measurement(
-        self,
-        predicted_state: GaussianState,
-        measurement_model: CartesianToElevationBearingRange | None = None,
-        measurement_noise: bool = True,
-        **kwargs: Any,
-    ) -> MeasurementPrediction:
-        """As `functions.cubature_transform`."""
-        model = self._check_measurement_model(measurement_model)
-        points = np.asarray(gauss2cubature(predicted_state), np.longdouble)
-        x, y, z = points[list(POSITION)]
-        r = np.sqrt(x**2 + y**2 + z**2)
-        seen = np.stack([np.arcsin(z / r), np.arctan2(y, x), r])
-        mean = np.stack([*np.arctan2(np.sin(seen[:2]).mean(axis=1), np.cos(seen[:2]).mean(axis=1)), r.mean()])
-        covariance = seen @ seen.T / r.size - np.outer(mean, mean)
-        cross = points @ seen.T / r.size - np.outer(points.mean(axis=1), mean)
-        if measurement_noise:
-            covariance += model.covar()
-        elevation, bearing, distance = map(float, mean)
-        return MeasurementPrediction.from_state(
-            predicted_state,
-            StateVector([Elevation(elevation), Bearing(bearing), distance]),
-            covariance.astype(float),
-            cross_covar=cross.astype(float),
-        )
-
-
-class SquareRootInitiator(SimpleMeasurementInitiator):
-    """The stock initiator, whose tracks begin in the form that `SqrtKalmanPredictor` asks for."""
-
-    def initiate(self, detections: set[Detection], timestamp: datetime.datetime, **kwargs: Any) -> set[Track]:
-        """As the stock one."""
-        states = [track.state for track in super().initiate(detections, timestamp, **kwargs)]
-        return {
-            Track(
-                [
-                    SqrtGaussianStateUpdate(
-                        state.state_vector,
-                        np.linalg.cholesky(state.covar),
-                        timestamp=state.timestamp,
-                        hypothesis=state.hypothesis,
-                    )
-                ]
-            )
-            for state in states
-        }
-
-
 @dataclass(frozen=True)
 class Components:
     """The parts of one tracker, each a stock Stone Soup object."""
@@ -230,7 +145,8 @@ def build_components(
         static: which components, by name.
     """
     model = measurement_model(params, exact_jacobian)
-    predictor, updater, first = build_filter(params, model, static)
+    transition, prior = transition_model(params.process_noise), prior_state(params)
+    predictor, updater, first = build_filter(params, static, transition, model, prior)
     distance = MEASURES[static.measure]()
     hypothesiser = DistanceGater(
         DistanceHypothesiser(predictor, updater, distance, missed_distance=params.missed_distance),
@@ -242,7 +158,7 @@ def build_components(
     initiator: Initiator = first
     if static.initiator == "multi_measurement":
         initiator = MultiMeasurementInitiator(
-            prior_state(params),
+            prior,
             deleter=deleter,
             data_associator=associator,
             updater=updater,
@@ -260,21 +176,6 @@ def build_components(
         initiator=initiator,
         deleter=deleter,
     )
-
-
-def build_filter(
-    params: Params, model: CartesianToElevationBearingRange, static: StaticParams
-) -> tuple[KalmanPredictor, KalmanUpdater, SimpleMeasurementInitiator]:
-    """Predictor and updater in the form asked for, and an initiator whose tracks have it."""
-    transition, prior = transition_model(params.process_noise), prior_state(params)
-    if static.covariance_form == "full":
-        updater = UPDATERS[static.filter](params)
-    else:
-        updater = SQUARE_ROOT_UPDATERS[static.filter](params)
-    if isinstance(updater, SqrtKalmanUpdater):
-        predictor = SqrtKalmanPredictor(transition, qr_method=True)
-        return predictor, updater, SquareRootInitiator(prior, model)
-    return KalmanPredictor(transition), updater, SimpleMeasurementInitiator(prior, model)
 
 
 def build_deleter(params: Params, static: StaticParams) -> Deleter:
