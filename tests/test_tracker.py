@@ -307,8 +307,9 @@ def test_other_parts_keep_the_rules_of_a_step(parts, tracks, detections):
     """Types are kept, NaN in empty rows changes no bit, an empty look is only a prediction."""
     static, params = StaticParams(**parts), Params(deletion_time=1.0, deletion_steps=5)
     start = lifecycle.no_tracks(5, static)
-    root = None if start.root is None else jnp.linalg.cholesky(tracks.covariance)
-    more = {"counts": start.counts, "tentative": start.tentative, "root": root}
+    more = {"counts": start.counts, "tentative": start.tentative}
+    if start.root is not None:
+        tracks = tracks.replace(root=jnp.nan_to_num(jnp.linalg.cholesky(tracks.covariance)))
     scenes = [
         (tracks.replace(**more), detections),
         (poison(tracks).replace(**more), poison(detections)),
