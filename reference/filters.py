@@ -2,6 +2,7 @@
 
 import datetime
 from collections.abc import Callable
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -43,7 +44,7 @@ The last one needs detections that were converted to positions: `translate.to_po
 
 SQUARE_ROOT_UPDATERS: dict[str, Callable[[Params], KalmanUpdater]] = {
     "unscented": UPDATERS["unscented"],
-    "extended": lambda _: SqrtKalmanUpdater(measurement_model=None),
+    "extended": lambda _: SharpSqrtKalmanUpdater(measurement_model=None, qr_method=True),
     "cubature": lambda _: UnscentedKalmanUpdater(measurement_model=None, alpha=1.0, beta=0.0, kappa=0.0),
     "converted": lambda _: SqrtKalmanUpdater(measurement_model=None, qr_method=True),
 }
@@ -81,6 +82,28 @@ class SharpCubatureKalmanUpdater(CubatureKalmanUpdater):
             StateVector([Elevation(elevation), Bearing(bearing), distance]),
             covariance.astype(float),
             cross_covar=cross.astype(float),
+        )
+
+
+class SharpSqrtKalmanUpdater(SqrtKalmanUpdater):
+    """The stock updater by its QR decomposition, which asks for a linear model's matrix, with the Jacobian.
+
+    Its other method takes square roots of matrices of mixed units, and is off by up to 7e-9 standard
+    deviations.
+    """
+
+    def _posterior_covariance(self, hypothesis: Any) -> tuple[np.ndarray, np.ndarray]:
+        model = hypothesis.measurement.measurement_model
+        matrix = self._measurement_matrix(hypothesis.prediction, model)
+        linear = SimpleNamespace(
+            matrix=lambda: matrix,
+            sqrt_covar=np.sqrt(model.covar().astype(float)),
+            ndim_meas=model.ndim_meas,
+            ndim_state=model.ndim_state,
+        )
+        seen = SimpleNamespace(measurement_model=linear)
+        return super()._posterior_covariance(
+            SimpleNamespace(prediction=hypothesis.prediction, measurement=seen)
         )
 
 

@@ -67,7 +67,7 @@ PARTS = (
     ),
     Part(
         "square_root with extended",
-        "SqrtKalmanUpdater, SqrtKalmanPredictor",
+        "SqrtKalmanUpdater by QR, SqrtKalmanPredictor",
         StaticParams(filter="extended", covariance_form="square_root"),
         is_filter=True,
         uses_jacobian=True,

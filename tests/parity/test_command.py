@@ -47,7 +47,7 @@ OTHER_PARTS = [
     "ExtendedKalmanUpdater",
     "CubatureKalmanUpdater",
     "KalmanUpdater with a LinearGaussian",
-    "SqrtKalmanUpdater, SqrtKalmanPredictor",
+    "SqrtKalmanUpdater by QR, SqrtKalmanPredictor",
     "SqrtKalmanUpdater with a LinearGaussian",
     "GNNWith2DAssignment",
     "UpdateTimeDeleter",
