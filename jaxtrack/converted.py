@@ -15,6 +15,7 @@ from jaxtrack.kalman import ExpectedDetections
 from jaxtrack.lifecycle import position_noise
 from jaxtrack.models import inverse_elevation_bearing_range
 from jaxtrack.params import Params
+from jaxtrack.square_root import position_noise_root
 from jaxtrack.types import Detections, Tracks
 
 
@@ -25,10 +26,12 @@ class Positions(struct.PyTreeNode):
         value: `[D, 3]` positions (m).
         noise: `[D, 3, 3]` their noise covariances ``G R G^T`` (m^2), G the Jacobian of the
             inverse measurement at the detection.
+        root: `[D, 3, 3]` factors of the noise (m), for the covariance form `square_root`.
     """
 
     value: jax.Array  # [D, 3]
     noise: jax.Array  # [D, 3, 3]
+    root: jax.Array  # [D, 3, 3]
 
 
 def convert(detections: Detections, params: Params) -> Positions:
@@ -36,6 +39,7 @@ def convert(detections: Detections, params: Params) -> Positions:
     return Positions(
         value=inverse_elevation_bearing_range(detections.value),
         noise=position_noise(detections.value, params),
+        root=position_noise_root(detections.value, params),
     )
 
 
@@ -55,6 +59,9 @@ def update(
     predicted: Tracks, expected: ExpectedDetections, positions: Positions, associated: jax.Array
 ) -> Tracks:
     """`kalman.update` with positions in place of detections."""
-    noise = positions.noise[jnp.maximum(associated, 0)]
-    seen = expected.replace(covariance=expected.covariance + noise)
+    own, factors = jnp.maximum(associated, 0), expected.factors
+    seen = expected.replace(
+        covariance=expected.covariance + positions.noise[own],
+        factors=None if factors is None else factors.replace(noise=positions.root[own]),
+    )
     return kalman.update(predicted, seen, Detections.from_values(positions.value), associated)

@@ -18,18 +18,19 @@ from jaxtrack.models import (
     interleave,
     interleave_blocks,
     inverse_elevation_bearing_range,
-    inverse_jacobian,
-    measurement_sigmas,
 )
 from jaxtrack.params import Params, StaticParams
 from jaxtrack.platform import platform_velocity
 from jaxtrack.sampling import matches
+from jaxtrack.square_root import initial_root, position_noise_root
 from jaxtrack.types import NO_DETECTION, Detections, Tracks, where_rows
 
 
 def no_tracks(max_tracks: int, static: StaticParams) -> Tracks:
     """A track list without tracks, with all that the deleters and the initiator keep of each."""
     tracks = Tracks.empty(max_tracks)
+    if static.covariance_form == "square_root":
+        tracks = tracks.replace(root=jnp.zeros_like(tracks.covariance))
     several = static.initiator == "multi_measurement"
     if several or static.deleters != ("covariance",):
         tracks = tracks.replace(counts=Counts.zero(max_tracks))
@@ -119,6 +120,9 @@ def initiate_tracks(
     # The k-th free slot takes the k-th unassociated detection.
     born, source = matches(~tracks.active, is_unassociated)
     mean, covariance = initial_estimate(detections.value, params)
+    root = None
+    if tracks.root is not None:
+        root = where_rows(born, initial_root(detections.value, params)[source], tracks.root)
     initiated = Tracks(
         mean=where_rows(born, mean[source], tracks.mean),
         covariance=where_rows(born, covariance[source], tracks.covariance),
@@ -127,6 +131,7 @@ def initiate_tracks(
         birth_step=jnp.where(born, step, tracks.birth_step),
         birth_detection=jnp.where(born, source, tracks.birth_detection),
         age=jnp.where(born, 0, tracks.age),
+        root=root,
         counts=None if tracks.counts is None else tracks.counts.initiated(born),
     )
     return initiated, jnp.sum(is_unassociated) - jnp.sum(born)
@@ -162,5 +167,5 @@ def initial_estimate(detection: jax.Array, params: Params) -> tuple[jax.Array, j
 
 def position_noise(detection: jax.Array, params: Params) -> jax.Array:
     """Covariance ``G R G^T`` `[..., 3, 3]` (m^2) of the position of detections `[..., 3]`."""
-    root = inverse_jacobian(detection) * measurement_sigmas(params)
+    root = position_noise_root(detection, params)
     return add_up(root[..., :, None, :] * root[..., None, :, :], axis=-1)

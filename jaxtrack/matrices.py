@@ -4,6 +4,8 @@ The batch comes last, so that neighbouring numbers take the same operations, and
 written out: for matrices this small, calling a library costs more than the arithmetic.
 """
 
+import functools
+
 import jax
 import jax.numpy as jnp
 
@@ -22,6 +24,47 @@ def cholesky(matrix: jax.Array) -> jax.Array:
         columns.append(reduced / jnp.sqrt(reduced[0]))
     above = [jnp.zeros_like(matrix[:k, 0]) for k in range(matrix.shape[0])]
     return jnp.stack([jnp.concatenate(pair) for pair in zip(above, columns, strict=True)], axis=1)
+
+
+def triangular_factor(matrix: jax.Array) -> jax.Array:
+    """Lower triangular L `[n, n, ...]` with ``L L^T = A A^T`` for matrices A `[n, m, ...]`, m >= n.
+
+    By Householder reflections, without the product A A^T: small numbers beside large ones are kept where a
+    Cholesky factor of the product would lose them. No diagonal of L is negative.
+    """
+    size = matrix.shape[0]
+    # In a loop: written out, XLA takes minutes.
+    reflected = jax.lax.fori_loop(0, size, _reflect, matrix)[:, :size]
+    lower = jnp.tril(jnp.ones((size, size), bool)).reshape(size, size, *(1 for _ in matrix.shape[2:]))
+    return jnp.where(lower, reflected, 0)
+
+
+def _reflect(j: jax.Array, matrix: jax.Array) -> jax.Array:
+    """Matrices A `[n, m, ...]` times a reflection after which row j is zero from column j + 1 on.
+
+    Rows before j have had their turn, and are not changed.
+    """
+    column = jnp.arange(matrix.shape[1]).reshape(-1, *(1 for _ in matrix.shape[2:]))
+    row = jnp.where(column >= j, jax.lax.dynamic_index_in_dim(matrix, j, keepdims=False), 0)
+    # Scaled, so that no square is too large or too small.
+    largest = functools.reduce(jnp.maximum, jnp.unstack(jnp.abs(row)))
+    row = row / jnp.where(largest == 0, 1, largest)
+    pivot = jax.lax.dynamic_index_in_dim(row, j)
+    length = jnp.sqrt(add_up(row * row))
+    mirror = jnp.where(column == j, pivot + jnp.copysign(length, pivot), row)
+    half_square = length * (length + jnp.abs(pivot[0]))
+    along = add_up(matrix * mirror, axis=1) / jnp.where(half_square == 0, 1, half_square)
+    turned = matrix - along[:, None] * mirror
+    return jnp.where(column == j, -jnp.copysign(1, pivot) * turned, turned)
+
+
+def solve_lower(factor: jax.Array, vector: jax.Array) -> jax.Array:
+    """``L^-1 b`` `[n, ...]` of lower triangular L `[n, n, ...]` and b `[n, ...]`, by substitution."""
+    solved: list[jax.Array] = []
+    for row, entry in zip(factor, vector, strict=True):
+        rest = entry - sum(a * b for a, b in zip(row, solved, strict=False))
+        solved.append(rest / row[len(solved)])
+    return jnp.stack(solved)
 
 
 def inverse_3x3(matrix: jax.Array) -> jax.Array:

@@ -33,6 +33,7 @@ MEASURES = (
     "squared_hellinger",
 )
 FILTERS = ("unscented", "extended", "cubature", "converted")
+COVARIANCE_FORMS = ("full", "square_root")
 ASSOCIATORS = ("nearest_neighbour", "global_nearest_neighbour")
 DELETERS = ("covariance", "update_time", "update_time_steps")
 INITIATORS = ("single_measurement", "multi_measurement")
@@ -93,6 +94,9 @@ class StaticParams:
     filter: str = "unscented"
     """Kalman filter of the tracks: unscented, extended, cubature, or converted (linear, on detections
     converted to positions)."""
+    covariance_form: str = "full"
+    """What the filter carries: full covariances, or square_root (their triangular factors), for float32
+    with noise or priors so extreme that full ones break."""
     associator: str = "nearest_neighbour"
     """Which detection belongs to which track: nearest_neighbour (greedy) or global_nearest_neighbour
     (the least total distance)."""
@@ -126,6 +130,7 @@ class StaticParams:
             ("reward", self.reward, REWARDS),
             ("measure", self.measure, MEASURES),
             ("filter", self.filter, FILTERS),
+            ("covariance_form", self.covariance_form, COVARIANCE_FORMS),
             ("associator", self.associator, ASSOCIATORS),
             ("initiator", self.initiator, INITIATORS),
         ]

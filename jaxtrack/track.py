@@ -29,6 +29,7 @@ from jaxtrack.cli import parse, require_file, run, take_config
 from jaxtrack.detection_file import RecordedDetections, read_detections
 from jaxtrack.params import (
     ASSOCIATORS,
+    COVARIANCE_FORMS,
     DELETERS,
     FILTERS,
     INITIATORS,
@@ -64,6 +65,7 @@ TRACKER_FIELDS = (
 
 TRACKER_CHOICES = {
     "filter": FILTERS,
+    "covariance_form": COVARIANCE_FORMS,
     "measure": MEASURES,
     "associator": ASSOCIATORS,
     "deleters": DELETERS,

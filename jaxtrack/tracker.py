@@ -62,7 +62,11 @@ def step(
 
     Returns:
         The track list after this step, and all intermediates.
+
+    Raises:
+        ValueError: if the track list did not begin as `lifecycle.no_tracks` of the same parts.
     """
+    _check_form(tracks, static)
     tracks, detections = _blank_empty_rows(tracks, detections, params)
     predicted = kalman.predict(tracks, time_step, params)
     expected, distances, associated, updated = _follow(predicted, detections, static, params)
@@ -166,12 +170,23 @@ def _initiate_confirmed(
     return tracks.replace(tentative=held), num_dropped + num_dropped_held
 
 
+def _check_form(tracks: Tracks, static: StaticParams) -> None:
+    held = "full" if tracks.root is None else "square_root"
+    if held != static.covariance_form:
+        raise ValueError(
+            f"tracks.root: the form of its covariances is {held}; expected a list that began as "
+            f"lifecycle.no_tracks(...) with covariance_form = {static.covariance_form!r}"
+        )
+
+
 def _blank_empty_rows(tracks: Tracks, detections: Detections, params: Params) -> tuple[Tracks, Detections]:
     """Puts harmless numbers into empty rows, so that neither values nor gradients turn NaN."""
     somewhere = params.min_range * jnp.eye(STATE_DIM)[0]
+    root = tracks.root
     tracks = tracks.replace(
         mean=where_rows(tracks.active, tracks.mean, somewhere),
         covariance=where_rows(tracks.active, tracks.covariance, jnp.eye(STATE_DIM)),
+        root=None if root is None else where_rows(tracks.active, root, jnp.eye(STATE_DIM)),
     )
     origin = params.min_range * jnp.eye(3)[2]
     return tracks, detections.replace(value=where_rows(detections.active, detections.value, origin))

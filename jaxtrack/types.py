@@ -87,6 +87,8 @@ class Tracks(struct.PyTreeNode):
         birth_step: `[T]` step on which the track was initiated.
         birth_detection: `[T]` index, on that step, of the detection that initiated it.
         age: `[T]` steps since birth; 0 on the birth step.
+        root: `[T, 6, 6]` factors L of the covariances, ``P = L L^T``; only with the covariance form
+            `square_root`.
         counts: detections so far and time without one; only where a deleter or the initiator asks.
         tentative: the tentative tracks of the initiator `multi_measurement`, also T; else None.
     """
@@ -98,6 +100,7 @@ class Tracks(struct.PyTreeNode):
     birth_step: jax.Array  # [T] int
     birth_detection: jax.Array  # [T] int
     age: jax.Array  # [T] int
+    root: jax.Array | None = None  # [T, 6, 6]
     counts: Counts | None = None
     tentative: "Tracks | None" = None
 

@@ -19,7 +19,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxtrack.kernel import add_up, stage
-from jaxtrack.matrices import cholesky
+from jaxtrack.matrices import cholesky, product, triangular_factor
 from jaxtrack.models import arctan2, measurement_sigmas, spherical, spherical_offsets, wrap_detection
 from jaxtrack.params import Params
 from jaxtrack.types import POSITION, STATE_DIM
@@ -64,13 +64,51 @@ def cubature_transform(
 
     I. Arasaratnam, S. Haykin, "Cubature Kalman filters", IEEE Transactions on Automatic Control 54 (2009).
     """
-    params = dataclasses.replace(params, alpha=1.0, beta=0.0, kappa=0.0)
-    expected, S, C, differences = _transform(mean, covariance, params)
+    expected, S, C, differences = _transform(mean, covariance, cubature(params))
     if mean.dtype == jnp.float32:
         return expected, S, C
     left = jnp.stack([*(_sum_points(angle) / POINTS for angle in differences[:2]), jnp.zeros_like(mean[0])])
     of_means = expected[:, None] * left
     return expected, S + of_means + jnp.swapaxes(of_means, 0, 1), C + mean[:, None] * left
+
+
+def cubature(params: Params) -> Params:
+    """The scaling with which the unscented transform is the cubature transform."""
+    return dataclasses.replace(params, alpha=1.0, beta=0.0, kappa=0.0)
+
+
+def square_root_transform(
+    mean: jax.Array, root: jax.Array, params: Params
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """`unscented_transform` of states with lower triangular factors `[6, 6, T]`, in factors.
+
+    Of a pair of opposite points the difference is what a linear measurement would give, and the mean what
+    its curvature adds, for S as noise does. Where points lie so wide around the radar that the centre's
+    negative weight makes that noise indefinite, it is left out.
+
+    Returns:
+        Expected elevation, bearing, range `[3, T]`; G `[3, 6, T]` and N `[3, 3, T]` as in
+        `square_root.Factors`.
+    """
+    relative = _relative_detections(mean, _spread(params) * jnp.swapaxes(root, 0, 1))
+    expected, shift = _mean_detection(mean, relative, params)
+    return expected, *_factors(_differences(relative, shift), shift, params)
+
+
+@stage
+def _factors(
+    differences: tuple[jax.Array, ...], shift: jax.Array, params: Params
+) -> tuple[jax.Array, jax.Array]:
+    centre_weight, weight = unscented_weights(params)
+    pairs = jnp.stack([difference.reshape(2, STATE_DIM, -1) for difference in differences])
+    plus, minus = pairs[:, 0], pairs[:, 1]
+    bent = jnp.sqrt(weight / 2) * (plus + minus)
+    centre, noise = wrap_detection(-shift, axis=0), jnp.diag(measurement_sigmas(params))[..., None]
+    squared = noise**2 + product(bent, jnp.swapaxes(bent, 0, 1)) + centre_weight * centre[:, None] * centre
+    N = cholesky(squared)
+    without_centre = triangular_factor(jnp.concatenate([bent, jnp.broadcast_to(noise, N.shape)], axis=1))
+    is_factor = jnp.isfinite(add_up(add_up(N)))
+    return jnp.sqrt(weight / 2) * (plus - minus), jnp.where(is_factor, N, without_centre)
 
 
 def _transform(
@@ -104,8 +142,12 @@ def sigma_offsets(covariance: jax.Array, params: Params) -> jax.Array:
     The scaled Cholesky columns; the other half are their opposites. Only the lower triangle of
     `covariance` `[6, 6, T]` is read, as LAPACK does for Stone Soup.
     """
-    spread = jnp.sqrt(params.alpha**2 * (STATE_DIM + params.kappa))
-    return spread * jnp.swapaxes(cholesky(covariance), 0, 1)
+    return _spread(params) * jnp.swapaxes(cholesky(covariance), 0, 1)
+
+
+def _spread(params: Params) -> jax.Array:
+    """Distance of the sigma points from the mean in columns of the factor."""
+    return jnp.sqrt(params.alpha**2 * (STATE_DIM + params.kappa))
 
 
 @stage

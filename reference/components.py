@@ -12,11 +12,10 @@ from stonesoup.deleter import Deleter
 from stonesoup.deleter.error import CovarianceBasedDeleter
 from stonesoup.deleter.multi import CompositeDeleter
 from stonesoup.deleter.time import UpdateTimeDeleter, UpdateTimeStepsDeleter
-from stonesoup.functions import gauss2cubature
 from stonesoup.gater.distance import DistanceGater
 from stonesoup.hypothesiser.distance import DistanceHypothesiser
 from stonesoup.initiator import Initiator
-from stonesoup.initiator.simple import MultiMeasurementInitiator, SimpleMeasurementInitiator
+from stonesoup.initiator.simple import MultiMeasurementInitiator
 from stonesoup.measures import Euclidean, Mahalanobis
 from stonesoup.measures.state import (
     GaussianHellinger,
@@ -31,21 +30,16 @@ from stonesoup.models.measurement.nonlinear import CartesianToElevationBearingRa
 from stonesoup.models.transition.linear import CombinedLinearGaussianTransitionModel, ConstantVelocity
 from stonesoup.predictor.kalman import KalmanPredictor
 from stonesoup.tracker.simple import MultiTargetTracker
-from stonesoup.types.angle import Bearing, Elevation
-from stonesoup.types.array import StateVector
 from stonesoup.types.detection import Detection
-from stonesoup.types.prediction import MeasurementPrediction
 from stonesoup.types.state import GaussianState, State
 from stonesoup.updater.kalman import (
-    CubatureKalmanUpdater,
-    ExtendedKalmanUpdater,
     KalmanUpdater,
-    UnscentedKalmanUpdater,
 )
 
 from jaxtrack.params import Params, StaticParams
 from jaxtrack.tracker import DEFAULT
 from jaxtrack.types import POSITION, STATE_DIM, VELOCITY
+from reference.filters import build_filter
 
 EPOCH = datetime.datetime(2000, 1, 1)
 """Time of step 0."""
@@ -62,19 +56,6 @@ MEASURES: dict[str, type[Measure]] = {
 
 The last three need detections that carry their own covariance (`GaussianDetection`): with a
 plain `Detection` they fail for want of one.
-"""
-
-UPDATERS: dict[str, Callable[[Params], KalmanUpdater]] = {
-    "unscented": lambda params: UnscentedKalmanUpdater(
-        measurement_model=None, alpha=params.alpha, beta=params.beta, kappa=params.kappa
-    ),
-    "extended": lambda _: ExtendedKalmanUpdater(measurement_model=None),
-    "cubature": lambda _: SharpCubatureKalmanUpdater(measurement_model=None),
-    "converted": lambda _: KalmanUpdater(measurement_model=None),
-}
-"""Stock updaters by the names of `jaxtrack.kalman.FILTERS`.
-
-The last one needs detections that were converted to positions: `translate.to_position`.
 """
 
 ASSOCIATORS: dict[str, type[DataAssociator]] = {
@@ -128,40 +109,6 @@ class ExactCartesianToElevationBearingRange(CartesianToElevationBearingRange):
         return jacobian
 
 
-class SharpCubatureKalmanUpdater(CubatureKalmanUpdater):
-    """The stock updater, but for its rounding: the same formulas in extended precision, radar at the origin.
-
-    It forms products of coordinates, as large as the square of a range, and what is left of their
-    difference is as small as a variance.
-    """
-
-    def predict_measurement(
-        self,
-        predicted_state: GaussianState,
-        measurement_model: CartesianToElevationBearingRange | None = None,
-        measurement_noise: bool = True,
-        **kwargs: Any,
-    ) -> MeasurementPrediction:
-        """As `functions.cubature_transform`."""
-        model = self._check_measurement_model(measurement_model)
-        points = np.asarray(gauss2cubature(predicted_state), np.longdouble)
-        x, y, z = points[list(POSITION)]
-        r = np.sqrt(x**2 + y**2 + z**2)
-        seen = np.stack([np.arcsin(z / r), np.arctan2(y, x), r])
-        mean = np.stack([*np.arctan2(np.sin(seen[:2]).mean(axis=1), np.cos(seen[:2]).mean(axis=1)), r.mean()])
-        covariance = seen @ seen.T / r.size - np.outer(mean, mean)
-        cross = points @ seen.T / r.size - np.outer(points.mean(axis=1), mean)
-        if measurement_noise:
-            covariance += model.covar()
-        elevation, bearing, distance = map(float, mean)
-        return MeasurementPrediction.from_state(
-            predicted_state,
-            StateVector([Elevation(elevation), Bearing(bearing), distance]),
-            covariance.astype(float),
-            cross_covar=cross.astype(float),
-        )
-
-
 @dataclass(frozen=True)
 class Components:
     """The parts of one tracker, each a stock Stone Soup object."""
@@ -198,8 +145,8 @@ def build_components(
         static: which components, by name.
     """
     model = measurement_model(params, exact_jacobian)
-    predictor = KalmanPredictor(transition_model(params.process_noise))
-    updater = UPDATERS[static.filter](params)
+    transition, prior = transition_model(params.process_noise), prior_state(params)
+    predictor, updater, first = build_filter(params, static, transition, model, prior)
     distance = MEASURES[static.measure]()
     hypothesiser = DistanceGater(
         DistanceHypothesiser(predictor, updater, distance, missed_distance=params.missed_distance),
@@ -208,15 +155,16 @@ def build_components(
     )
     associator = ASSOCIATORS[static.associator](hypothesiser)
     deleter = build_deleter(params, static)
-    initiator: Initiator = SimpleMeasurementInitiator(prior_state(params), model)
+    initiator: Initiator = first
     if static.initiator == "multi_measurement":
         initiator = MultiMeasurementInitiator(
-            prior_state(params),
+            prior,
             deleter=deleter,
             data_associator=associator,
             updater=updater,
             measurement_model=model,
             min_points=static.min_points,
+            initiator=first,
         )
     return Components(
         measurement_model=model,

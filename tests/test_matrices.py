@@ -3,12 +3,15 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from jaxtrack import matrices
 
 cholesky = jax.jit(matrices.cholesky)
+triangular_factor = jax.jit(matrices.triangular_factor)
+solve_lower = jax.jit(matrices.solve_lower)
 inverse_3x3 = jax.jit(matrices.inverse_3x3)
 
 
@@ -48,6 +51,41 @@ def test_inverse_3x3_needs_no_symmetry(x64):
 def test_determinant_3x3_equals_numpys(x64, seed):
     matrix = np.random.default_rng(seed).normal(size=(3, 3))
     np.testing.assert_allclose(matrices.determinant_3x3(matrix), np.linalg.det(matrix), atol=1e-12)
+
+
+@given(st.integers(0, 10_000), st.sampled_from([(3, 5), (4, 4), (1, 1)]))
+def test_triangular_factors_have_the_same_product(x64, seed, shape):
+    matrix = np.random.default_rng(seed).normal(size=shape) * 10.0 ** np.arange(shape[0])[:, None]
+    factor = np.asarray(triangular_factor(jnp.asarray(matrix)))
+    np.testing.assert_array_equal(factor, np.tril(factor))
+    assert np.all(np.diagonal(factor) >= 0)
+    scale = np.linalg.norm(matrix, axis=1)
+    np.testing.assert_allclose(
+        factor @ factor.T / np.outer(scale, scale),
+        (matrix / scale[:, None]) @ (matrix / scale[:, None]).T,
+        atol=1e-13,
+    )
+
+
+def test_a_triangular_factor_keeps_in_float32_what_a_product_loses():
+    """Variances that differ by a factor of 1e16: beside the larger one the smaller is less than rounding."""
+    matrix = np.array([[1e6, 0, 1e-2], [1e6, 1e-2, 0]], np.float32)
+    factor = np.asarray(triangular_factor(matrix), float)
+    assert factor[1, 1] == pytest.approx(np.sqrt(2) * 1e-2, rel=1e-5)
+    assert not np.linalg.det(matrix @ matrix.T) > 0
+
+
+def test_triangular_factors_of_rows_of_zeros_and_of_extreme_numbers():
+    for scale in (0.0, 1e-30, 1e30):
+        factor = np.asarray(triangular_factor(np.full((2, 3), scale, np.float32)))
+        expected = np.sqrt(3) * scale * np.array([[1, 0], [1, 0]])
+        np.testing.assert_allclose(factor, expected, atol=3e-7 * scale)
+
+
+@given(st.integers(0, 10_000))
+def test_solving_by_substitution(x64, seed):
+    factor = np.tril(np.random.default_rng(seed).normal(size=(3, 3))) + 3 * np.eye(3)
+    np.testing.assert_allclose(solve_lower(factor, factor @ np.arange(3)), np.arange(3), atol=1e-12)
 
 
 def test_many_matrices_at_once_equal_each_alone(x64):

@@ -40,6 +40,7 @@ def test_looks_per_axis_is_not_rounded_up_by_the_last_bit():
         ("reward", "unknown"),
         ("filter", "particle"),
         ("filter", None),
+        ("covariance_form", "joseph"),
         ("associator", "probabilistic"),
         ("deleters", "covariance"),
         ("deleters", ["covariance"]),

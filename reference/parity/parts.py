@@ -60,6 +60,31 @@ PARTS = (
         is_filter=True,
     ),
     Part(
+        "square_root with unscented",
+        "UnscentedKalmanUpdater, which has no square-root form",
+        StaticParams(covariance_form="square_root"),
+        is_filter=True,
+    ),
+    Part(
+        "square_root with extended",
+        "SqrtKalmanUpdater by QR, SqrtKalmanPredictor",
+        StaticParams(filter="extended", covariance_form="square_root"),
+        is_filter=True,
+        uses_jacobian=True,
+    ),
+    Part(
+        "square_root with cubature",
+        "UnscentedKalmanUpdater with alpha = 1, beta = 0, kappa = 0",
+        StaticParams(filter="cubature", covariance_form="square_root"),
+        is_filter=True,
+    ),
+    Part(
+        "square_root with converted",
+        "SqrtKalmanUpdater with a LinearGaussian model per detection",
+        StaticParams(filter="converted", covariance_form="square_root"),
+        is_filter=True,
+    ),
+    Part(
         "association.associate_global_nearest_neighbour",
         "GNNWith2DAssignment",
         StaticParams(associator="global_nearest_neighbour"),

@@ -47,6 +47,8 @@ OTHER_PARTS = [
     "ExtendedKalmanUpdater",
     "CubatureKalmanUpdater",
     "KalmanUpdater with a LinearGaussian",
+    "SqrtKalmanUpdater by QR, SqrtKalmanPredictor",
+    "SqrtKalmanUpdater with a LinearGaussian",
     "GNNWith2DAssignment",
     "UpdateTimeDeleter",
     "UpdateTimeStepsDeleter",

@@ -13,7 +13,7 @@ import pytest
 from stonesoup.measures import Mahalanobis
 from stonesoup.types.detection import Detection
 from stonesoup.types.hypothesis import SingleHypothesis
-from stonesoup.types.prediction import GaussianStatePrediction
+from stonesoup.types.prediction import GaussianStatePrediction, SqrtGaussianStatePrediction
 from stonesoup.types.state import State
 from stonesoup.types.track import Track
 from stonesoup.types.update import Update
@@ -93,6 +93,35 @@ def test_expected_detection_and_posterior(name, towards):
         posterior = parts.updater.update(SingleHypothesis(prediction, detection))
         posterior = SimpleNamespace(state_vector=posterior.state_vector, covar=posterior.covar)
         moved = mean_error(posterior.state_vector, prediction.state_vector, posterior.covar)
+        assert estimate_error(updated, slot, estimate(posterior)) <= TOLERANCE * max(1.0, moved)
+
+
+@pytest.mark.parametrize("name", ["extended", "converted"])
+def test_square_root_prediction_and_posterior(name):
+    """`SqrtKalmanPredictor` and `SqrtKalmanUpdater` from the same factors."""
+    tracks, predictions, value = scene(AHEAD)
+    root = np.linalg.cholesky(tracks.covariance)
+    parts = build_components(PARAMS, static=StaticParams(filter=name, covariance_form="square_root"))
+
+    @jax.jit
+    def play(tracks):
+        predicted = kalman.predict(tracks, 1.0, PARAMS)
+        expected, seen = kalman.FILTERS[name](predicted, PARAMS), Detections.from_values(value)
+        if name == "converted":
+            seen = converted.convert(seen, PARAMS)
+            return predicted, converted.update(predicted, expected, seen, jnp.arange(COUNT))
+        return predicted, kalman.update(predicted, expected, seen, jnp.arange(COUNT))
+
+    predicted, updated = play(tracks.replace(root=jnp.asarray(root)))
+    later = EPOCH + datetime.timedelta(seconds=1)
+    detections = to_detections(value, np.ones(COUNT, bool), 1, later, parts.measurement_model)
+    for slot, (prior, detection) in enumerate(zip(predictions, detections, strict=True)):
+        start = SqrtGaussianStatePrediction(prior.state_vector, root[slot], EPOCH)
+        theirs = parts.predictor.predict(start, timestamp=later)
+        assert estimate_error(predicted, slot, estimate(theirs)) <= TOLERANCE
+        seen = to_position(detection) if name == "converted" else detection
+        posterior = parts.updater.update(SingleHypothesis(theirs, seen))
+        moved = mean_error(posterior.state_vector, theirs.state_vector, posterior.covar)
         assert estimate_error(updated, slot, estimate(posterior)) <= TOLERANCE * max(1.0, moved)
 
 

@@ -133,6 +133,7 @@ CHOICES = {
     "reward": "as_printed",
     "measure": "hellinger",
     "filter": "extended",
+    "covariance_form": "square_root",
     "associator": "global_nearest_neighbour",
     "deleters": ("covariance", "update_time"),
     "initiator": "multi_measurement",
