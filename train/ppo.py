@@ -16,7 +16,7 @@ from rich.progress import Progress
 
 from jaxtrack.cli import INTERRUPTED, parse, run, take_config, wide_console
 from jaxtrack.env import SearchTrack, make
-from jaxtrack.scenarios import read_scenario
+from jaxtrack.scenarios import RECORDING, read_scenario
 from train import learner
 from train.checkpoint import learner_shapes
 from train.config import TrainConfig, from_dict
@@ -24,6 +24,7 @@ from train.display import columns, note, print_config, say_now_and_then
 from train.evaluate import COMPARED_SEED, agent, compare_with_baselines
 from train.interrupt import Interrupt, exit_code
 from train.learner import LearnerState
+from train.recorded import with_recording
 from train.results import print_results, summarise, write_results
 from train.run_folder import Run, require_unchanged, resume_run, start_run
 from train.saved_run import read_config
@@ -47,8 +48,9 @@ class Options(TrainConfig):
     resume: str = ""
     """Folder of an interrupted run to continue; beside it only --evaluation-episodes may be given."""
     scenario: str = ""
-    """Scenario by name (paper, clutter, births, agile, turning, accelerating, crowd, swarm, slow, flying), or
-    a .toml or .json file with fields of Params and StaticParams. It sets the defaults of these below."""
+    """Scenario by name (paper, clutter, births, agile, turning, accelerating, crowd, swarm, slow, flying,
+    continuous), or a .toml or .json file with fields of Params and StaticParams, or a .csv file of OpenSky
+    state vectors. It sets the defaults of these below, and --recording."""
 
 
 def main(argv: Sequence[str]) -> int:
@@ -78,13 +80,13 @@ def open_run(argv: Sequence[str]) -> AbstractContextManager[Run]:
     if not options.resume:
         if options.scenario:
             options = _parse(on_scenario(from_dict(values), options.scenario), rest)
-        return start_run(_config(options))
+        return start_run(with_recording(_config(options)))
     for name, given in (("config", values), ("scenario", options.scenario)):
         if given:
             raise ValueError(f"{name}: expected none beside --resume, which takes the run's own")
     folder = Path(options.resume)
-    own, _ = read_config(folder)
-    wanted = _config(_parse(own, rest))
+    own, saved = read_config(folder)
+    wanted = _config(_parse(from_dict(saved), rest))
     require_unchanged(own, wanted)
     return resume_run(folder, wanted.evaluation_episodes)
 
@@ -96,10 +98,14 @@ def on_scenario(config: TrainConfig, name: str) -> TrainConfig:
         ValueError: naming what is wrong with the scenario.
     """
     fields = read_scenario(name)
-    if "trajectories" in fields:
-        raise ValueError(f"scenario = {name!r}: expected no recording, which config.json can not hold")
+    recording = name if Path(name).suffix == RECORDING else ""
+    if "trajectories" in fields and not recording:
+        raise ValueError(f"scenario = {name!r}: expected trajectories in a {RECORDING} file, not in this one")
     env, params = make(config.params, config.static, **fields)
-    return dataclasses.replace(config, static=env.static, params=params)
+    params = dataclasses.replace(params, trajectories=None)  # read again, as options may change the rest
+    return dataclasses.replace(
+        config, static=env.static, params=params, recording=recording, recording_sha256=""
+    )
 
 
 def _parse(config: TrainConfig, argv: Sequence[str]) -> Options:
