@@ -23,7 +23,7 @@ from jaxtrack.params import Params, StaticParams
 from jaxtrack.platform import platform_velocity
 from jaxtrack.sampling import matches
 from jaxtrack.square_root import initial_root, position_noise_root
-from jaxtrack.types import NO_DETECTION, Detections, Tracks, where_rows
+from jaxtrack.types import NO_DETECTION, Detections, Scalar, Tracks, where_rows
 
 
 def no_tracks(max_tracks: int, static: StaticParams) -> Tracks:
@@ -119,7 +119,7 @@ def initiate_tracks(
     """
     # The k-th free slot takes the k-th unassociated detection.
     born, source = matches(~tracks.active, is_unassociated)
-    mean, covariance = initial_estimate(detections.value, params)
+    mean, covariance = initial_estimate(detections.value, params, step)
     root = None
     if tracks.root is not None:
         root = where_rows(born, initial_root(detections.value, params)[source], tracks.root)
@@ -150,8 +150,8 @@ def take_over(tracks: Tracks, tentative: Tracks, confirmed: jax.Array) -> tuple[
     return full, jnp.sum(confirmed) - jnp.sum(taken)
 
 
-def initial_estimate(detection: jax.Array, params: Params) -> tuple[jax.Array, jax.Array]:
-    """States `[..., 6]` and covariances `[..., 6, 6]` of tracks from one detection `[..., 3]` each.
+def initial_estimate(detection: jax.Array, params: Params, step: Scalar = 0) -> tuple[jax.Array, jax.Array]:
+    """States `[..., 6]` and covariances `[..., 6, 6]` of tracks from one detection `[..., 3]` of a step each.
 
     The position is the inverse measurement with covariance ``G R G^T``, G the exact Jacobian
     of the inverse; the velocity is the prior's, at rest in the world with `prior_velocity_sigma`.
@@ -161,7 +161,7 @@ def initial_estimate(detection: jax.Array, params: Params) -> tuple[jax.Array, j
     of_velocity = jnp.broadcast_to(params.prior_velocity_sigma**2 * jnp.eye(3), of_place.shape)
     none = jnp.zeros_like(of_place)
     covariance = interleave_blocks(of_place, none, none, of_velocity)
-    at_rest = jnp.zeros_like(place) - platform_velocity(params)
+    at_rest = jnp.zeros_like(place) - platform_velocity(params, step)
     return interleave(place, at_rest), covariance
 
 

@@ -32,6 +32,25 @@ def constant_velocity(time_step: Scalar, process_noise: Scalar) -> tuple[jax.Arr
     return jnp.kron(axes, F), jnp.kron(axes, Q)
 
 
+def turn(velocities: jax.Array, rates: jax.Array, time_step: Scalar) -> tuple[jax.Array, jax.Array]:
+    """A coordinated turn about the vertical: way `[N, 3]` (m) and velocities after one time step.
+
+    Counterpart in Stone Soup: `KnownTurnRate` in x and y, constant velocity in z.
+
+    Args:
+        velocities: `[N, 3]` (m/s).
+        rates: `[N]`, positive to the left (rad/s).
+        time_step: (s).
+    """
+    angle = rates * time_step
+    sin, cos = jnp.sin(angle), jnp.cos(angle)
+    ahead = jnp.sinc(angle / jnp.pi)  # sin(angle) / angle, also at 0
+    aside = jnp.sinc(angle / (2 * jnp.pi)) * jnp.sin(angle / 2)  # (1 - cos(angle)) / angle
+    x, y, z = jnp.moveaxis(velocities, -1, 0)
+    way = time_step * jnp.stack([ahead * x - aside * y, aside * x + ahead * y, z], axis=-1)
+    return way, jnp.stack([cos * x - sin * y, sin * x + cos * y, z], axis=-1)
+
+
 def arctan2(y: jax.Array, x: jax.Array) -> jax.Array:
     """Angle (rad) of ``(x, y)``, elementwise, of arrays of one shape: within 2 units in the last place.
 

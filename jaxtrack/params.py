@@ -199,6 +199,9 @@ class Params:
     platform_speed: float = _quantity(0.0, "m/s", 0.0)
     """The radar's platform flies ahead, along its x axis, at this known speed; all positions and velocities
     are relative to it (m/s)."""
+    platform_turn_rate: float | None = _quantity(None, "rad/s", -1e3, 1e3)
+    """Its heading turns about the vertical, to the left where positive, at this known rate, by the number of
+    the step times `time_step`; the frame keeps its axes (rad/s). Unset, it flies straight on."""
     elevation_sigma: float = _quantity(2e-3, "rad", 0.0, math.pi, open_low=True)
     """Standard deviation of measured elevation (rad)."""
     bearing_sigma: float = _quantity(2e-3, "rad", 0.0, math.pi, open_low=True)

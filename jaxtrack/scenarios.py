@@ -46,7 +46,7 @@ def read_scenario(name: str) -> dict[str, Any]:
     if name in SCENARIOS:
         return SCENARIOS[name]
     if (suffix := Path(name).suffix) == RECORDING:
-        return _read_recording(Path(name))
+        return read_recording(Path(name))
     if suffix not in (".toml", ".json"):
         raise ValueError(
             f"scenario = {name!r}: expected {', '.join(SCENARIOS)}, or a .toml, .json or .csv file"
@@ -54,11 +54,20 @@ def read_scenario(name: str) -> dict[str, Any]:
     return {field: _frozen(value) for field, value in _without_tables(read_config(Path(name))).items()}
 
 
-def _read_recording(path: Path) -> dict[str, Any]:
+def read_recording(path: Path, **fields: Any) -> dict[str, Any]:
+    """Fields of the scenario of a file of OpenSky state vectors.
+
+    Args:
+        path: the file.
+        **fields: arguments of `jaxtrack.trajectories.scenario`.
+
+    Raises:
+        ValueError: naming the file and what is wrong with it.
+    """
     from jaxtrack.trajectories import read_opensky, scenario
 
     try:
-        return scenario(read_opensky(path))
+        return scenario(read_opensky(path), **fields)
     except OSError as error:
         raise ValueError(f"scenario = {str(path)!r}: {error.strerror}") from None
 

@@ -12,6 +12,7 @@ from jaxtrack import association, converted, kalman, lifecycle
 from jaxtrack.association import ASSOCIATORS, MEASURES
 from jaxtrack.kalman import FILTERS, ExpectedDetections
 from jaxtrack.params import Params, StaticParams
+from jaxtrack.platform import seen_in_turn
 from jaxtrack.types import STATE_DIM, Detections, Scalar, Tracks, where_rows
 
 
@@ -68,7 +69,7 @@ def step(
     """
     _check_form(tracks, static)
     tracks, detections = _blank_empty_rows(tracks, detections, params)
-    predicted = kalman.predict(tracks, time_step, params)
+    predicted = _predict(tracks, time_step, index, params)
     expected, distances, associated, updated = _follow(predicted, detections, static, params)
     surviving = lifecycle.delete_tracks(updated, static, params)
     new = lifecycle.unassociated(detections, associated)
@@ -87,6 +88,12 @@ def step(
         initiated=tracks.active & ~surviving.active,
         num_dropped=num_dropped,
     )
+
+
+def _predict(tracks: Tracks, time_step: Scalar, index: jax.Array, params: Params) -> Tracks:
+    """The track list at this step; the platform's turn is known."""
+    predicted = kalman.predict(tracks, time_step, params)
+    return predicted.replace(mean=seen_in_turn(predicted.mean, index, params))
 
 
 _Update = tuple[kalman.ExpectedDetections, jax.Array, jax.Array, Tracks]
@@ -160,7 +167,7 @@ def _initiate_confirmed(
     if tracks.tentative is None:
         raise ValueError("tracks.tentative = None: expected a list that began as lifecycle.no_tracks(...)")
     tentative, detections = _blank_empty_rows(tracks.tentative, detections, params)
-    predicted = kalman.predict(tentative, time_step, params)
+    predicted = _predict(tentative, time_step, index, params)
     _, _, associated, updated = _follow(predicted, detections, static, params)
     confirmed = updated.active & (lifecycle.counts_of(updated).hits >= static.min_points)
     tracks, num_dropped = lifecycle.take_over(tracks, updated, confirmed)

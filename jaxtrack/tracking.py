@@ -115,8 +115,13 @@ def track_scans(
         Live tracks of the next scans, until all S are done.
 
     Raises:
-        ValueError: if the pairs of detections and tracks of a scan need more than `MEMORY_LIMIT`.
+        ValueError: if the pairs of detections and tracks of a scan need more than `MEMORY_LIMIT`, or the
+            platform turns, as that is known at even steps only.
     """
+    if params.platform_turn_rate is not None:
+        raise ValueError(
+            f"platform_turn_rate = {params.platform_turn_rate}: expected None with recorded scans"
+        )
     state, done, rows, compile_seconds = _empty(SMALLEST, static), 0, None, 0.0
     after = state
     try:

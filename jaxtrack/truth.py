@@ -9,9 +9,9 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from jaxtrack.models import direction, interleave
+from jaxtrack.models import direction, interleave, turn
 from jaxtrack.params import Params, StaticParams
-from jaxtrack.platform import platform_velocity
+from jaxtrack.platform import platform_velocity, seen_in_turn
 from jaxtrack.sampling import poisson_quantile
 from jaxtrack.types import Scalar, Truths, position, velocity
 
@@ -60,7 +60,9 @@ def initiate_truths(key: jax.Array, static: StaticParams, params: Params) -> Tru
     return Truths(state=state, alive=jnp.arange(n) < first)
 
 
-def born_state(angles: jax.Array, share: jax.Array, velocity: jax.Array, params: Params) -> jax.Array:
+def born_state(
+    angles: jax.Array, share: jax.Array, velocity: jax.Array, params: Params, step: Scalar = 0
+) -> jax.Array:
     """States `[N, 6]` of new truths.
 
     Args:
@@ -68,11 +70,12 @@ def born_state(angles: jax.Array, share: jax.Array, velocity: jax.Array, params:
         share: `[N, 1]` place between the smallest and the largest range, in [0, 1].
         velocity: `[N, 3]` standard normal.
         params: numbers of the scenario.
+        step: of their birth.
     """
     azimuth, elevation = params.field_limit * angles[:, 0], params.field_limit * angles[:, 1]
     distance = params.min_range + share * (params.max_range - params.min_range)
     positions = distance * direction(azimuth, elevation)
-    velocities = params.truth_velocity_sigma * velocity - platform_velocity(params)
+    velocities = params.truth_velocity_sigma * velocity - platform_velocity(params, step)
     return interleave(positions, velocities)
 
 
@@ -96,9 +99,10 @@ def propagate_truths(
         return replay_truths(step, params), num_born, jnp.zeros_like(num_born)
     surviving = end_truths(truths, noise.death, params)
     moved = move_truths(surviving, noise.motion, params)
+    moved = moved.replace(state=seen_in_turn(moved.state, step, params))
     truths, num_wanted = jax.lax.cond(
         jnp.asarray(params.birth_rate) > 0,
-        lambda: begin_truths(moved, num_born, noise, params),
+        lambda: begin_truths(moved, num_born, noise, params, step),
         lambda: (moved, num_born),
     )
     rows = truths.alive.shape[0]
@@ -146,25 +150,6 @@ def fly(velocities: jax.Array, params: Params) -> tuple[jax.Array, jax.Array]:
     return way, after
 
 
-def turn(velocities: jax.Array, rates: jax.Array, time_step: Scalar) -> tuple[jax.Array, jax.Array]:
-    """A coordinated turn about the vertical: way `[N, 3]` (m) and velocities after one time step.
-
-    Counterpart in Stone Soup: `KnownTurnRate` in x and y, constant velocity in z.
-
-    Args:
-        velocities: `[N, 3]` (m/s).
-        rates: `[N]`, positive to the left (rad/s).
-        time_step: (s).
-    """
-    angle = rates * time_step
-    sin, cos = jnp.sin(angle), jnp.cos(angle)
-    ahead = jnp.sinc(angle / jnp.pi)  # sin(angle) / angle, also at 0
-    aside = jnp.sinc(angle / (2 * jnp.pi)) * jnp.sin(angle / 2)  # (1 - cos(angle)) / angle
-    x, y, z = jnp.moveaxis(velocities, -1, 0)
-    way = time_step * jnp.stack([ahead * x - aside * y, aside * x + ahead * y, z], axis=-1)
-    return way, jnp.stack([cos * x - sin * y, sin * x + cos * y, z], axis=-1)
-
-
 def spread_directions(number: int) -> jax.Array:
     """Unit vectors `[number, 3]`, evenly over the sphere (Fibonacci lattice)."""
     row = jnp.arange(number)
@@ -173,7 +158,7 @@ def spread_directions(number: int) -> jax.Array:
 
 
 def begin_truths(
-    truths: Truths, num_born: jax.Array, noise: TruthNoise, params: Params
+    truths: Truths, num_born: jax.Array, noise: TruthNoise, params: Params, step: Scalar = 0
 ) -> tuple[Truths, jax.Array]:
     """A Poisson number of new truths, in rows never used: a row is one truth for the whole episode.
 
@@ -183,7 +168,7 @@ def begin_truths(
     row = jnp.arange(truths.alive.shape[0])
     births = num_births(noise, params)
     born = (row >= num_born) & (row < num_born + births)
-    state = jnp.where(born[:, None], newborn_states(noise, params), truths.state)
+    state = jnp.where(born[:, None], newborn_states(noise, params, step), truths.state)
     return Truths(state=state, alive=truths.alive | born), num_born + births
 
 
@@ -192,13 +177,13 @@ def num_births(noise: TruthNoise, params: Params) -> jax.Array:
     return poisson_quantile(noise.birth_count, params.birth_rate, MOST_BIRTHS * noise.death.shape[0])
 
 
-def newborn_states(noise: TruthNoise, params: Params) -> jax.Array:
+def newborn_states(noise: TruthNoise, params: Params, step: Scalar = 0) -> jax.Array:
     """States `[N, 6]` that the rows would have if they were born on this step.
 
     A newborn does not move: its six draws of motion serve for its place and velocity.
     """
     uniform = jax.scipy.stats.norm.cdf(noise.motion[:, :, 0])
-    return born_state(2 * uniform[:, :2] - 1, uniform[:, 2:], noise.motion[:, :, 1], params)
+    return born_state(2 * uniform[:, :2] - 1, uniform[:, 2:], noise.motion[:, :, 1], params, step)
 
 
 def process_noise_factor(time_step: Scalar, process_noise: Scalar) -> jax.Array:

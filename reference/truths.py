@@ -143,7 +143,7 @@ def scripted_simulator(script: Script, params: Params) -> FieldTruths:
 
 
 def _simulator(states: np.ndarray, params: Params, **parts: Any) -> FieldTruths:
-    for name in ("truth_turn_rate", "truth_acceleration", "trajectories"):
+    for name in ("truth_turn_rate", "truth_acceleration", "platform_turn_rate", "trajectories"):
         if getattr(params, name) is not None:
             raise ValueError(f"{name}: expected None, these truths fly straight")
     return FieldTruths(

@@ -1,6 +1,9 @@
 """Scenarios by name: each trains, evaluates and renders; and what a name or a file is taken for."""
 
+import csv
+import os
 import re
+import signal
 
 import jax
 import numpy as np
@@ -11,15 +14,17 @@ from jaxtrack import render
 from jaxtrack.recording import record_episode
 from jaxtrack.scenarios import SCENARIOS, read_scenario
 from tests.aircraft_file import state_rows, write_states
-from tests.train.small_run import OPTIONS
+from tests.train.small_run import OPTIONS, assert_same_result
 from train import evaluate, ppo
-from train.saved_run import read_config
+from train.agents import agent_policy
+from train.metrics_file import MetricsFile
+from train.saved_run import load_run
 
 pytestmark = pytest.mark.usefixtures("quick_compilation")
 
 STEPS = 3
-NOT_TRAINED = ("continuous",)
-"""The agents choose discrete looks."""
+RECORDING = "a recording"
+"""Beside the names: a file of aircraft."""
 QUICK, QUICKLY_DRAWN = ("accelerating",), ("turning", "swarm", "flying", "continuous")
 """Those that the quick tests play; the others run with -m slow."""
 OF_SCENARIOS = ("num-truths", "max-tracks", "max-detections", "max-clutter")
@@ -48,13 +53,90 @@ def short(monkeypatch):
         monkeypatch.setattr(f"{module}.read_scenario", cut)
 
 
-@pytest.mark.parametrize("name", each(name for name in SCENARIOS if name not in NOT_TRAINED))
-def test_each_trains(name, tmp_path):
-    run = tmp_path / "run"
-    assert ppo.main(["--scenario", name, *WORDS, *LEARN, "--out", str(run)]) == 0
-    config, _ = read_config(run)
-    assert_has_fields(name, config.static, config.params)
+def train(name, folder, *more):
+    """Trains an agent for two updates, and gives its folder and the exit code."""
+    scenario = str(write_states(folder / "states.csv", state_rows(12))) if name == RECORDING else name
+    run = folder / "run"
+    return run, ppo.main(["--scenario", scenario, *WORDS, *LEARN, "--out", str(run), *more])
+
+
+@pytest.fixture(scope="module", params=each([*SCENARIOS, RECORDING]))
+def trained(request, quick_compilation, tmp_path_factory):
+    """A scenario, and the folder of an agent that was trained on it."""
+    run, code = train(request.param, tmp_path_factory.mktemp("runs"))
+    assert code == 0
+    return request.param, run
+
+
+def test_each_trains(trained):
+    name, run = trained
+    config, env, _ = load_run(run)
+    if name == RECORDING:
+        assert config.params.trajectories.shape == (7, env.static.num_truths, 6)
+    else:
+        assert_has_fields(name, env.static, config.params)
     assert len((run / "metrics.csv").read_text().splitlines()) == 3  # what is not finite ends it before
+
+
+@pytest.mark.slow
+def test_each_agent_is_evaluated_and_drawn(trained, monkeypatch, tmp_path):
+    _, run = trained
+    shown = []
+    monkeypatch.setattr(evaluate, "print_results", lambda comparison, *_: shown.append(comparison.played))
+    assert evaluate.main(["--run", str(run), "--policies", "random", "--episodes", "2"]) == 0
+    assert list(shown[0]) == ["beams", "random"]
+    assert all(np.isfinite(one.values["gospa"]).all() for one in shown[0].values())
+    config, env, weights = load_run(run)
+    policy = agent_policy(config.encoder, weights, head=config.head)(env.static, config.params)
+    episode = record_episode(env, config.params, policy, jax.random.key(0))
+    assert render.animate(episode, tmp_path / "agent.gif", stride=2) == 3
+    assert (tmp_path / "agent.gif").stat().st_size > 10_000
+
+
+@pytest.mark.slow
+def test_angles_of_looks_are_learned_as_their_numbers_are(tmp_path):
+    metrics = []
+    for name in ("paper", "continuous"):
+        (tmp_path / name).mkdir()
+        run, _ = train(name, tmp_path / name)
+        rows = csv.DictReader((run / "metrics.csv").read_text().splitlines())
+        own = ("reward", "policy_loss", "entropy", "gradient_norm", "value_loss")
+        metrics.append([[float(row[column]) for column in own] for row in rows])
+    np.testing.assert_allclose(metrics[1], metrics[0], rtol=1e-3)
+
+
+@pytest.mark.slow
+def test_any_angle_may_be_learned_and_played(tmp_path):
+    head = ["--encoder", "flatten", "--head", "gaussian", "--static.map-size", "36"]
+    run, code = train("continuous", tmp_path, *head)
+    assert code == 0
+    for more in ([], ["--greedy"]):
+        assert evaluate.main(["--run", str(run), "--policies", "random", "--episodes", "2", *more]) == 0
+    config, env, weights = load_run(run)
+    policy = agent_policy(config.encoder, weights, head=config.head)(env.static, config.params)
+    looks = record_episode(env, config.params, policy, jax.random.key(0)).records.look
+    assert len(np.unique(looks)) == looks.size
+    assert np.abs(looks).max() <= config.params.field_limit
+
+
+@pytest.mark.slow
+def test_a_training_on_a_recording_resumes_as_if_it_had_not_stopped(tmp_path, monkeypatch):
+    folders = [tmp_path / name for name in ("whole", "stopped")]
+    for folder in folders:
+        folder.mkdir()
+    whole, _ = train(RECORDING, folders[0])
+    write = MetricsFile.write
+
+    def write_and_stop(self, row):
+        write(self, row)
+        os.kill(os.getpid(), signal.SIGINT)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(MetricsFile, "write", write_and_stop)
+        stopped, code = train(RECORDING, folders[1])
+    assert code == 130
+    assert ppo.main(["--resume", str(stopped)]) == 0
+    assert_same_result(stopped, whole)
 
 
 @pytest.mark.parametrize("name", each(SCENARIOS))
@@ -99,8 +181,7 @@ def test_every_help_names_them_all(options, capsys):
     with pytest.raises(SystemExit):
         command.main(["--help"])
     said = capsys.readouterr().out
-    trained = [name for name in SCENARIOS if command is evaluate or name not in NOT_TRAINED]
-    assert ", ".join(trained) in re.sub(r"[\s│]+", " ", said)
+    assert ", ".join(SCENARIOS) in re.sub(r"[\s│]+", " ", said)
 
 
 def test_options_win_over_the_scenario_and_the_scenario_over_the_file(monkeypatch, tmp_path):
@@ -118,11 +199,9 @@ def test_options_win_over_the_scenario_and_the_scenario_over_the_file(monkeypatc
 def test_what_can_not_be_trained_is_refused(tmp_path):
     with pytest.raises(ValueError, match=r"^scenario: expected none beside --resume"):
         ppo.open_run(["--resume", str(tmp_path), "--scenario", "slow"])
-    with pytest.raises(ValueError, match=r"^static.continuous_actions = True: expected False"):
-        ppo.open_run(["--scenario", "continuous", "--out", str(tmp_path / "run")]).__enter__()
-    recorded = write_states(tmp_path / "states.csv", state_rows(12))
-    with pytest.raises(ValueError, match=r"^scenario = '.*states.csv': expected no recording"):
-        ppo.open_run(["--scenario", str(recorded)])
+    (tmp_path / "typed.json").write_text('{"num_truths": 1, "trajectories": [[[1, 2, 3, 4, 5, 6]]]}')
+    with pytest.raises(ValueError, match=r"^scenario = '.*typed.json': expected trajectories in a .csv file"):
+        ppo.open_run(["--scenario", str(tmp_path / "typed.json")])
 
 
 def test_fields_of_a_file_may_stand_in_tables_or_alone(tmp_path):

@@ -114,7 +114,10 @@ def test_the_fields_are_exactly_those_that_the_tracker_uses(recorded):
 
     quantities = [field.name for field in dataclasses.fields(Params) if field.metadata]
     # min_range only fills rows that are empty.
-    unused = set(quantities) - set(track.TRACKER_FIELDS) - {"min_range"}
+    # A known turn needs even steps and is refused.
+    with pytest.raises(ValueError, match=r"^platform_turn_rate = 0.1: expected None with recorded scans"):
+        numbers(Params(platform_turn_rate=0.1))
+    unused = set(quantities) - set(track.TRACKER_FIELDS) - {"min_range", "platform_turn_rate"}
     plain = Params(deletion_threshold=3200.0)
     for ours, theirs in zip(
         numbers(plain.replace(**dict.fromkeys(unused, math.nan))), numbers(plain), strict=True

@@ -12,7 +12,7 @@ from jaxtrack.observation import Observation, observe
 from jaxtrack.params import Params, StaticParams
 from jaxtrack.policies import Policy, PolicyBuilder
 from train.beams import BeamGeometry, BeamNetwork
-from train.distributions import FACTORED, JOINT, Distribution
+from train.distributions import FACTORED, JOINT, Distribution, Gaussian, OnGrid
 from train.networks import ANY_LENGTH, ENCODERS, PaperNetwork
 
 AGENTS = ("beams", *ENCODERS)
@@ -93,9 +93,9 @@ def build_agent(name: str, static: StaticParams, params: Params, head: str = "be
     if name not in AGENTS:
         raise ValueError(f"encoder = {name!r}: expected one of {', '.join(AGENTS)}")
     if name == "beams":
-        return Agent(BeamGeometry(static, params), BeamNetwork(), JOINT)
+        return Agent(BeamGeometry(static, params), BeamNetwork(), build_distribution(head, static, params))
     network = PaperNetwork(encoder=name, head=head, num_looks=static.num_looks)
-    distribution = FACTORED if head == "factored" else JOINT
+    distribution = build_distribution(head, static, params)
     lists = TrackLists(static.max_tracks, used_slots, cut_lists) if name in ANY_LENGTH else None
     if head != "beams":
         return Agent(lambda observation: observation, network, distribution, lists)
@@ -103,6 +103,14 @@ def build_agent(name: str, static: StaticParams, params: Params, head: str = "be
     return Agent(
         lambda observation: {**observation, "beams": beams(observation)}, network, distribution, lists
     )
+
+
+def build_distribution(head: str, static: StaticParams, params: Params) -> Distribution:
+    """The distribution that a head's logits belong to, over indices or over angles."""
+    if head == "gaussian":
+        return Gaussian(params.field_limit)
+    indices = FACTORED if head == "factored" else JOINT
+    return OnGrid(indices, static, params) if static.continuous_actions else indices
 
 
 def used_slots(observations: dict[str, Any]) -> jax.Array:

@@ -29,7 +29,8 @@ class TrainConfig:
     paper's track-list encoders flatten, bigru, mhsa."""
     head: str = "beams"
     """How the paper's networks choose a look: beams (worths of what lies in each beam), joint (one
-    softmax over all looks), or factored (azimuth and elevation apart, as in the paper)."""
+    softmax over all looks), factored (azimuth and elevation apart, as in the paper), or, where actions
+    are continuous, gaussian (any angle; the others take the angles of discrete looks)."""
     total_steps: int = 400_000
     """Environment steps, rounded down to whole updates."""
     num_envs: int = 64
@@ -95,6 +96,12 @@ class TrainConfig:
     randomise: Ranges = dataclasses.field(default_factory=dict)
     """Numbers that every episode draws uniformly, as in detection_probability=0.8:1 initial_truths=2:10.
     The agent is not told; `params` count for the evaluation, and for all that the agent computes."""
+
+    recording: str = ""
+    """File of OpenSky state vectors whose aircraft are the truths; --scenario FILE.csv sets it, and the
+    numbers that suit it. It must stay where it is for as long as the run is to be resumed or played."""
+    recording_sha256: str = ""
+    """Digest of that file; it is filled in, and a file with another one is refused."""
 
     static: StaticParams = dataclasses.field(
         default_factory=lambda: StaticParams(reward="shortfall", search_sharpness=16, observe_variances=True)
@@ -167,9 +174,12 @@ def check(config: TrainConfig) -> None:
         raise ValueError(
             f"static.map_size = {config.static.map_size}: expected an integer >= {SMALLEST_MAP} for NatureCNN"
         )
-    if config.static.continuous_actions:
-        raise ValueError("static.continuous_actions = True: expected False, the agents choose discrete looks")
+    of_indices = ", ".join(name for name in HEADS if name != "gaussian")
+    is_possible = config.static.continuous_actions or config.head != "gaussian"
+    _require(config, "head", is_possible, f"one of {of_indices} without static.continuous_actions")
     validate(config.static, config.params)
+    is_read = bool(config.recording) == (config.params.trajectories is not None)
+    _require(config, "recording", is_read, "the file of params.trajectories, as --scenario FILE.csv")
     for name in ("stop_above", "stop_below"):
         check_thresholds(name, getattr(config, name), config.static.info_metrics)
     _require(config, "curriculum_share", 0 < config.curriculum_share <= 1, "a number in (0, 1]")
@@ -202,8 +212,9 @@ def _require(config: TrainConfig, name: str, holds: bool, expected: str) -> None
 
 
 def to_dict(config: TrainConfig) -> dict[str, Any]:
-    """Plain nested dictionary, for JSON."""
-    return dataclasses.asdict(config)
+    """Plain nested dictionary, for JSON; without trajectories, which `recording` names."""
+    params = dataclasses.replace(config.params, trajectories=None)
+    return dataclasses.asdict(dataclasses.replace(config, params=params))
 
 
 def first_difference(these: Any, those: Any, name: str = "") -> tuple[str, Any, Any] | None:

@@ -103,7 +103,7 @@ def step_row(
     return StepRow(
         values=values,
         truths=truths,
-        tracks=tracks.replace(covariance=None, updated_by=None, age=None),
+        tracks=tracks.replace(covariance=None, root=None, updated_by=None, age=None),
         tracked=jnp.any(distances < params.gospa_cutoff, axis=-1),
         look=look_number(record.look, env.static, params),
     )

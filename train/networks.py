@@ -26,7 +26,7 @@ ANY_LENGTH = ("bigru", "mhsa")
 """Those that take a track list of any length, and to which empty slots at its end make no difference."""
 
 
-HEADS = ("beams", "joint", "factored")
+HEADS = ("beams", "joint", "factored", "gaussian")
 """How a network of the paper chooses a look, by the name used on the command line."""
 
 
@@ -41,7 +41,8 @@ class PaperNetwork(nn.Module):
     The paper's head is "factored": azimuth and elevation each on their own
     (`train.distributions.FACTORED`). "joint" is one softmax over all looks, and "beams" makes their
     logits from prices of what they search and from urgencies of the tracks in their beams
-    (`train.beams`); both are `train.distributions.JOINT`.
+    (`train.beams`); both are `train.distributions.JOINT`. "gaussian" is for continuous actions: the
+    moments of azimuth and elevation (`train.distributions.Gaussian`).
     """
 
     encoder: str = "mhsa"
@@ -62,7 +63,8 @@ class PaperNetwork(nn.Module):
                 "beams" the `BeamInputs` as `beams`.
 
         Returns:
-            Logits `[B, 2, L]` of azimuth and elevation index, or `[B, L * L]` of all looks, and values `[B]`.
+            Logits `[B, 2, L]` of azimuth and elevation index, `[B, L * L]` of all looks, or `[B, 2, 2]`
+            moments of azimuth and elevation; and values `[B]`.
 
         Raises:
             ValueError: if `encoder` is not a name in `ENCODERS`, or `head` none in `HEADS`.
@@ -84,6 +86,8 @@ class PaperNetwork(nn.Module):
 
         if self.head == "factored":
             return policy(2 * self.num_looks).reshape(-1, 2, self.num_looks)
+        if self.head == "gaussian":
+            return policy(4).reshape(-1, 2, 2)
         if self.head == "joint":
             return policy(self.num_looks**2)
         beams = observation["beams"]

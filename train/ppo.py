@@ -14,13 +14,14 @@ from rich.console import Console
 
 from jaxtrack.cli import INTERRUPTED, parse, run, take_config, wide_console
 from jaxtrack.env import SearchTrack, make
-from jaxtrack.scenarios import read_scenario
-from train.config import TrainConfig, from_dict
+from jaxtrack.scenarios import RECORDING, read_scenario
+from train.config import TrainConfig, from_dict, to_dict
 from train.display import TrainingBar, print_config
 from train.evaluate import COMPARED_SEED, agent, compare_with_baselines
 from train.interrupt import Interrupt, exit_code
 from train.learner import LearnerState
 from train.loop import FAILED, compile_training, first_state, train
+from train.recorded import with_recording
 from train.results import print_results, summarise, write_results
 from train.run_folder import Run, require_unchanged, resume_run, start_run
 from train.saved_run import read_config
@@ -47,8 +48,9 @@ class Options(TrainConfig):
     """Folder of an interrupted run, or of several seeds, to continue; beside it only
     --evaluation-episodes may be given."""
     scenario: str = ""
-    """Scenario by name (paper, clutter, births, agile, turning, accelerating, crowd, swarm, slow, flying), or
-    a .toml or .json file with fields of Params and StaticParams. It sets the defaults of these below."""
+    """Scenario by name (paper, clutter, births, agile, turning, accelerating, crowd, swarm, slow, flying,
+    continuous), or a .toml or .json file with fields of Params and StaticParams, or a .csv file of OpenSky
+    state vectors. It sets the defaults of these below, and --recording."""
 
 
 def main(argv: Sequence[str]) -> int:
@@ -78,7 +80,7 @@ def open_run(argv: Sequence[str]) -> AbstractContextManager[Run | Seeds]:
     if not options.resume:
         if options.scenario:
             options = _parse(on_scenario(from_dict(values), options.scenario), rest)
-        config = _config(options)
+        config = with_recording(_config(options))
         return start_run(config) if options.seeds == 1 else start_seeds(config, options.seeds)
     for name, given in (("config", values), ("scenario", options.scenario)):
         if given:
@@ -94,7 +96,7 @@ def open_again(folder: Path, argv: Sequence[str]) -> AbstractContextManager[Run 
     """
     several = read_seeds(folder) if holds_seeds(folder) else None
     own, number = (several.config, several.number) if several else (read_config(folder)[0], 1)
-    options = _parse(own, argv, number)
+    options = _parse(from_dict(to_dict(own)), argv, number)  # read again, a recording is no option
     wanted = _config(options)
     if options.seeds != number:
         raise ValueError(f"seeds = {options.seeds}: expected {number} as in the run")
@@ -111,10 +113,14 @@ def on_scenario(config: TrainConfig, name: str) -> TrainConfig:
         ValueError: naming what is wrong with the scenario.
     """
     fields = read_scenario(name)
-    if "trajectories" in fields:
-        raise ValueError(f"scenario = {name!r}: expected no recording, which config.json can not hold")
+    recording = name if Path(name).suffix == RECORDING else ""
+    if "trajectories" in fields and not recording:
+        raise ValueError(f"scenario = {name!r}: expected trajectories in a {RECORDING} file, not in this one")
     env, params = make(config.params, config.static, **fields)
-    return dataclasses.replace(config, static=env.static, params=params)
+    params = dataclasses.replace(params, trajectories=None)  # read again, as options may change the rest
+    return dataclasses.replace(
+        config, static=env.static, params=params, recording=recording, recording_sha256=""
+    )
 
 
 def _parse(config: TrainConfig, argv: Sequence[str], seeds: int = 1) -> Options:

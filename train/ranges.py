@@ -64,6 +64,8 @@ def _check_range(
 ) -> None:
     if name not in CHANGEABLE:
         raise ValueError(f"{place}: can not change, expected one of {', '.join(CHANGEABLE)}")
+    if name == "time_step" and params.trajectories is not None:
+        raise ValueError(f"{place}: can not change where truths are recorded")
     if not isinstance(ends, (tuple, list)) or len(ends) != 2:
         raise ValueError(f"{place} = {ends!r}: expected two numbers, from and to")
     for end in ends:

@@ -18,6 +18,7 @@ from train.checkpoint import (
 )
 from train.config import TrainConfig, check, first_difference, from_dict, to_dict
 from train.learner import LearnerState
+from train.recorded import with_recording
 from train.sealed import read_json, write_whole
 
 
@@ -59,7 +60,7 @@ def read_config(folder: Path) -> tuple[TrainConfig, dict[str, Any]]:
     except OSError:
         raise ValueError(f"run = {str(folder)!r}: expected a folder with a config.json") from None
     try:
-        config = from_dict(values)
+        config = with_recording(from_dict(values))
         check(dataclasses.replace(config, out=""))
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None

@@ -1,6 +1,7 @@
 """The datasheet's table of scenarios: `python -m train.scenario_table` plays rules on each of them."""
 
 import dataclasses
+import sys
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -41,7 +42,11 @@ def main(argv: Sequence[str]) -> int:
     options = parse(Options(), argv, PROG)
     check(options)
     started = time.perf_counter()
-    rows = [row(name, options) for name in options.scenarios]
+    rows = []
+    for number, name in enumerate(options.scenarios, start=1):
+        rows.append(row(name, options))
+        done = f"{number}/{len(options.scenarios)} {name}: {(time.perf_counter() - started) / 60:.1f} min"
+        print(done, file=sys.stderr, flush=True)
     table = markdown_table(["scenario", "what differs from `paper`", *options.policies], rows)
     made = f"{table}\n\n{made_with(options, argv, time.perf_counter() - started)}"
     print(made)

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from jaxtrack.cli import LARGEST_SEED, require_integer
 from train.config import TrainConfig, check, first_difference, from_dict, to_dict
+from train.recorded import with_recording
 from train.run_folder import Run, resume_command, resume_run, start_run
 from train.saved_run import read_config
 from train.sealed import read_json, write_whole
@@ -110,7 +111,7 @@ def read_seeds(folder: Path) -> Seeds:
     path = folder / SEEDS
     try:
         values = read_json(path)
-        number, config = values.get("seeds"), from_dict(values.get("config", {}))
+        number, config = values.get("seeds"), with_recording(from_dict(values.get("config", {})))
         check(dataclasses.replace(config, out=""))
         if type(number) is not int:
             raise ValueError(f"seeds = {number!r}: expected an integer")

@@ -1,5 +1,7 @@
 """Agents by name, and trained agents in the form of the baselines."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -8,13 +10,15 @@ import pytest
 from jaxtrack import Params, StaticParams
 from jaxtrack.env import SearchTrack
 from jaxtrack.observation import observe
+from jaxtrack.sensor import look_angles
 from train.agents import AGENTS, Agent, agent_policy, build_agent
 from train.beams import BeamGeometry, BeamNetwork
-from train.distributions import FACTORED, JOINT
+from train.distributions import FACTORED, JOINT, Gaussian, OnGrid
 
 pytestmark = pytest.mark.usefixtures("quick_compilation")
 
 STATIC = StaticParams(num_truths=2, max_tracks=3, map_size=36, num_looks=4)
+CONTINUOUS = dataclasses.replace(STATIC, continuous_actions=True)
 PARAMS = Params()
 
 
@@ -56,6 +60,15 @@ def test_the_papers_networks_take_every_head(name, head, distribution, logits):
     assert shapes(agent) == [logits, (2,)]
 
 
+@pytest.mark.parametrize(
+    ("head", "kind", "logits"), [("factored", OnGrid, (2, 2, 4)), ("gaussian", Gaussian, (2, 2, 2))]
+)
+def test_continuous_actions_have_distributions_of_angles(head, kind, logits):
+    agent = build_agent("flatten", CONTINUOUS, PARAMS, head)
+    assert isinstance(agent.distribution, kind)
+    assert shapes(agent) == [logits, (2,)]
+
+
 def test_an_unknown_name_is_refused():
     with pytest.raises(ValueError, match=r"^encoder = 'cnn': expected one of beams, flatten, bigru, mhsa$"):
         build_agent("cnn", STATIC, PARAMS)
@@ -82,6 +95,17 @@ def test_greedy_takes_the_most_probable_look(state, weights):
     for seed in range(3):
         action = greedy(jax.random.key(seed), state)
         np.testing.assert_array_equal(action, np.unravel_index(np.argmax(logits), (4, 4)))
+
+
+def test_an_agent_looks_at_the_angles_that_it_would_look_at_by_index(state, weights):
+    for greedy in (False, True):
+        indices, angles = (
+            jax.jit(agent_policy("beams", weights, greedy)(static, PARAMS)) for static in (STATIC, CONTINUOUS)
+        )
+        for time in range(3):
+            key, now = jax.random.key(7), state.replace(time=time)
+            expected = look_angles(indices(key, now), STATIC, PARAMS)
+            np.testing.assert_allclose(angles(key, now), expected, atol=1e-6)
 
 
 def test_samples_follow_from_the_key_and_the_time(state, weights):

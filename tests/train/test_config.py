@@ -3,10 +3,12 @@
 import dataclasses
 import json
 
+import numpy as np
 import pytest
 
 from jaxtrack import Params, StaticParams
 from train.config import TrainConfig, check, from_dict, to_dict
+from train.networks import HEADS
 
 SMALL = {"num_envs": 4, "rollout_steps": 8, "num_minibatches": 2, "microbatch": 8, "total_steps": 64}
 NAN, INF = float("nan"), float("inf")
@@ -54,10 +56,22 @@ def test_counts_that_may_be_zero_are_not_negative(name):
 
 
 def test_heads_are_known_and_the_beam_policy_has_one():
-    assert refusal(encoder="mhsa", head="cells") == "head = 'cells': expected one of beams, joint, factored"
+    assert (
+        refusal(encoder="mhsa", head="cells")
+        == "head = 'cells': expected one of beams, joint, factored, gaussian"
+    )
     assert refusal(head="joint") == "head = 'joint': expected beams, the head of beams"
     for head in ("beams", "joint", "factored"):
         check(TrainConfig(**{**SMALL, "encoder": "mhsa", "head": head}))
+
+
+def test_a_gaussian_is_of_angles():
+    assert refusal(encoder="mhsa", head="gaussian") == (
+        "head = 'gaussian': expected one of beams, joint, factored without static.continuous_actions"
+    )
+    continuous = StaticParams(continuous_actions=True)
+    for head in HEADS:
+        check(TrainConfig(**{**SMALL, "encoder": "mhsa", "head": head}, static=continuous))
 
 
 @pytest.mark.parametrize("name", ["gamma", "gae_lambda"])
@@ -106,8 +120,11 @@ def test_encoder_is_one_that_exists():
 def test_the_scenario_is_checked_too():
     assert refusal(params=Params(time_step=-1.0)).startswith("time_step = -1.0: expected a number in (0,")
     assert refusal(params=Params(clutter_rate=NAN)).startswith("clutter_rate = nan: expected")
-    assert refusal(static=StaticParams(continuous_actions=True)).startswith(
-        "static.continuous_actions = True: expected False"
+    assert refusal(recording="states.csv").startswith(
+        "recording = 'states.csv': expected the file of params."
+    )
+    assert refusal(params=Params(trajectories=np.zeros((2, 10, 6)))).startswith(
+        "recording = '': expected the "
     )
 
 

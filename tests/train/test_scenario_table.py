@@ -30,7 +30,9 @@ def test_the_command_replaces_the_table_of_a_page(tmp_path, monkeypatch, capsys)
         r"^\| `tiny.toml` \| `num_truths` 2, .*`beam_azimuth` 0.9 rad \| [\d.]+ ± [\d.]+ \|$", text, re.M
     )
     assert "mean over 3 episodes" in text
-    assert capsys.readouterr().out in text.partition(BEGIN)[2]
+    said = capsys.readouterr()
+    assert said.out in text.partition(BEGIN)[2]
+    assert re.fullmatch(r"1/1 tiny.toml: \d+\.\d min\n", said.err)
 
 
 @pytest.mark.parametrize(
