@@ -13,6 +13,8 @@ GUIDE = ROOT / "docs/guide"
 PAGES = sorted(GUIDE.glob("*.md"))
 BLOCK = re.compile(r"```([^\n]*)\n(.*?)```", re.DOTALL)
 LANGUAGES = {"python", "python sb3", "sh"}
+LONG = ("train", "evaluate")
+"""Pages that train: they run with -m slow, in CI too."""
 
 
 def blocks(page):
@@ -48,7 +50,12 @@ def folder(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    "page", [page for page in PAGES if "sb3" not in page.name], ids=lambda page: page.stem
+    "page",
+    [
+        pytest.param(page, id=page.stem, marks=[pytest.mark.slow] if page.stem in LONG else [])
+        for page in PAGES
+        if "sb3" not in page.name
+    ],
 )
 def test_a_page_runs(page, folder, capsys, quick_compilation):
     run_page(page, capsys)
