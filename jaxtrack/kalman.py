@@ -161,17 +161,14 @@ def update(
     is_updated = associated != NO_DETECTION
     innovation = expected.innovation(detections.value[jnp.maximum(associated, 0)] - expected.mean)
     if predicted.root is None or expected.factors is None:
-        root, (change, reduction) = None, _gain(expected, innovation)
-        mean = where_rows(is_updated, predicted.mean + change, predicted.mean)
-        covariance = where_rows(is_updated, predicted.covariance - reduction, predicted.covariance)
+        change, reduction = _gain(expected, innovation)
+        root, covariance = None, predicted.covariance - reduction
     else:
         change, updated = square_root.update_root(predicted.root, expected.factors, innovation)
-        root = where_rows(is_updated, updated, predicted.root)
-        mean = where_rows(is_updated, predicted.mean + change, predicted.mean)
-        covariance = where_rows(is_updated, square(updated), predicted.covariance)
+        root, covariance = where_rows(is_updated, updated, predicted.root), square(updated)
     return predicted.replace(
-        mean=mean,
-        covariance=covariance,
+        mean=where_rows(is_updated, predicted.mean + change, predicted.mean),
+        covariance=where_rows(is_updated, covariance, predicted.covariance),
         root=root,
         updated_by=associated,
         counts=None if predicted.counts is None else predicted.counts.updated(is_updated),

@@ -138,9 +138,10 @@ def _look_anew(carry: _Carry, closed: Stretch, step: jax.Array) -> _Carry:
     behind = _take_up(carry.behind, closed)
     started = behind.start <= step
     together = started & (step <= behind.end)
-    # The next step back on which something changes: a start is left, an end is met, or was met now.
+    # The next step back on which something changes: a start is left, an end is met. After an end that is
+    # met now, the very next one.
     change = jnp.where(together, behind.start - 1, _NEVER)
-    change = jnp.where(started & (behind.end <= step), behind.end - (behind.end == step), change)
+    change = jnp.where(started & (behind.end <= step), behind.end, change)
     view = _View(
         together, together & (step < behind.end), _stretch_end(behind, together), jnp.max(change) + 1
     )

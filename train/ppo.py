@@ -189,7 +189,7 @@ def finish_seeds(weights: dict[int, Any], env: SearchTrack, seeds: Seeds, consol
     if failed:
         print(f"not all were trained to their end, so nothing is compared; missing: seed {', '.join(failed)}")
         if weights:
-            runs = shlex.join(str(seeds.folder / f"seed{seed}") for seed in weights)
+            runs = shlex.join(str(seeds.folder_of(seed)) for seed in weights)
             print(f"evaluate the others with: python -m train.evaluate --runs {runs}")
         return FAILED
     if seeds.evaluation_episodes:

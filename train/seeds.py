@@ -43,7 +43,11 @@ class Seeds:
     @property
     def folders(self) -> list[Path]:
         """The run folder of each seed, made or not."""
-        return [self.folder / f"seed{seed}" for seed in self.seeds]
+        return [self.folder_of(seed) for seed in self.seeds]
+
+    def folder_of(self, seed: int) -> Path:
+        """The run folder of one seed."""
+        return self.folder / f"seed{seed}"
 
     @property
     def resume_command(self) -> str:
@@ -63,7 +67,7 @@ class Seeds:
             ValueError: one line, if its folder holds another run, or nothing intact to continue from.
             OSError: if the folder can not be written, or another training writes there.
         """
-        folder = self.folder / f"seed{seed}"
+        folder = self.folder_of(seed)
         config = dataclasses.replace(self.config, seed=seed, out=str(folder))
         if (folder / "config.json").exists():
             self._require_own(folder, config)
