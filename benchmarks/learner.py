@@ -1,5 +1,10 @@
 """Steps per second of our learner and of Stable-Baselines3's PPO: `python -m benchmarks.learner`."""
 
+from jaxtrack import cores
+
+if __name__ == "__main__":
+    cores.use()  # before gymnax is imported, which starts JAX
+
 import dataclasses
 import sys
 from collections.abc import Callable, Sequence

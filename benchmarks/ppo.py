@@ -13,9 +13,10 @@ import jax
 from jaxtrack.cli import require_file, require_integer
 from jaxtrack.params import Params, StaticParams
 from jaxtrack.report import PACKAGES
-from train import learner
 from train.config import TrainConfig
-from train.learner import LearnerState
+from train.devices import with_devices
+from train.learner_state import LearnerState
+from train.loop import jit_training
 from train.networks import ENCODERS
 
 REPORTED = (*PACKAGES, "flax", "optax", "stable-baselines3", "torch")
@@ -95,6 +96,7 @@ def configure(encoder: str, options: UpdateOptions) -> TrainConfig:
         seed=options.seed,
         warm_start="none",
         anneal=False,
+        target_kl=0.0,
         static=StaticParams(),
         params=Params(),
     )
@@ -144,9 +146,9 @@ class OurLearner:
 
 def build_learner(config: TrainConfig, env: Any) -> OurLearner:
     """The first state of our learner, and its compiled training step."""
-    init = jax.jit(lambda key, params: learner.init_learner(key, params, env, config))
-    state = init(jax.random.key(config.seed), config.params)
-    step = jax.jit(lambda state: learner.train_step(state, env, config), donate_argnums=0)
+    jitted: Any
+    jitted, shapes = jit_training(env, with_devices(config))
+    state = jitted.init(jax.random.key(config.seed), config.params)
     programs: list[Any] = []
-    compiling = seconds_of(lambda: programs.append(step.lower(state).compile()))
+    compiling = seconds_of(lambda: programs.append(jitted.step.lower(shapes).compile()))
     return OurLearner(state, programs[0], compiling)

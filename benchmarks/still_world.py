@@ -8,7 +8,7 @@ from flax import struct
 
 from jaxtrack.observation import TRACK_FEATURES, Observation
 from jaxtrack.params import Params, StaticParams
-from train.learner import LOGGED
+from train.rollout import LOGGED
 
 Step = tuple[Observation, "StillState", jax.Array, jax.Array, jax.Array, dict[str, Any]]
 

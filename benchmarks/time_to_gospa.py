@@ -61,11 +61,12 @@ def train_until(goal: float, config: TrainConfig) -> dict[str, Any]:
     began = time.perf_counter()
     env, _ = make(config.params, config.static)
     learner = build_learner(config, env)
-    evaluate = compile_evaluation(config, env, learner.state.weights)
+    evaluate = compile_evaluation(config, env, jax.device_get(learner.state.weights))
     compiled, evaluations = time.perf_counter() - began, list[dict[str, float]]()
     for update in range(1, config.num_updates + 1):
         learner()
-        gospa = evaluate(learner.state.weights, COMPARED_SEED + 1)
+        weights = jax.device_get(learner.state.weights)
+        gospa = evaluate(weights, COMPARED_SEED + 1)
         seconds = time.perf_counter() - began
         steps = update * config.batch_size
         evaluations.append({"env_steps": steps, "seconds": seconds, "gospa": gospa})
@@ -79,7 +80,7 @@ def train_until(goal: float, config: TrainConfig) -> dict[str, Any]:
         "seconds": seconds,
         "compile_seconds": compiled,
         "gospa": gospa,
-        "gospa_on_other_scenarios": evaluate(learner.state.weights, COMPARED_SEED),
+        "gospa_on_other_scenarios": evaluate(weights, COMPARED_SEED),
         "evaluations": evaluations,
     }
 

@@ -1,5 +1,10 @@
 """Training end to end beside stock PPO on Stone Soup: `python -m benchmarks.training`."""
 
+from jaxtrack import cores
+
+if __name__ == "__main__":
+    cores.use()  # before gymnax is imported, which starts JAX
+
 import dataclasses
 import math
 from collections.abc import Sequence

@@ -15,7 +15,7 @@ from jaxtrack import Params, StaticParams
 from jaxtrack.env import SearchTrack
 from jaxtrack.report import PACKAGES
 from tests.missing_module import run_without
-from train.learner import LOGGED
+from train.rollout import LOGGED
 
 pytestmark = pytest.mark.usefixtures("quick_compilation")
 

@@ -41,10 +41,10 @@ def bigru(params):
     state = {f"dense.0.{name}": value for name, value in dense(params["Dense_0"]).items()}
     for direction, suffix in (("forward", ""), ("backward", "_reverse")):
         gru = params[direction]
-        bias = np.zeros(gru["Dense_0"]["bias"].shape, np.float32)
+        bias = np.zeros(gru["bias"].shape, np.float32)
         bias[2 * len(bias) // 3 :] = gru["recurrent_bias"]
-        state[f"gru.weight_ih_l0{suffix}"] = gru["Dense_0"]["kernel"].T
-        state[f"gru.bias_ih_l0{suffix}"] = gru["Dense_0"]["bias"]
+        state[f"gru.weight_ih_l0{suffix}"] = gru["kernel"].T
+        state[f"gru.bias_ih_l0{suffix}"] = gru["bias"]
         state[f"gru.weight_hh_l0{suffix}"] = gru["recurrent_kernel"].T
         state[f"gru.bias_hh_l0{suffix}"] = bias
     return state

@@ -22,7 +22,8 @@ import numpy as np
 from jaxtrack.env import SearchTrack
 from jaxtrack.report import circumstances
 from train.config import TrainConfig, to_dict
-from train.learner import LearnerState, init_learner
+from train.learner import init_learner
+from train.learner_state import LearnerState
 from train.sealed import check_seal, remove_sealed, seal_of, write_sealed
 
 KEPT = 2

@@ -35,6 +35,9 @@ class TrainConfig:
     """Environment steps, rounded down to whole updates."""
     num_envs: int = 64
     """Environments that run side by side."""
+    devices: int = 0
+    """Cores of the CPU, or accelerators, that share the environments and the learning; it changes nothing
+    but speed and rounding. 0: as many as there are and can share equally; config.json says how many."""
     seed: int = 0
     """Seed of everything random."""
     out: str = ""
@@ -73,6 +76,9 @@ class TrainConfig:
     """Decay of the advantage estimate."""
     clip: float = 0.2
     """Largest change of a probability ratio that is rewarded."""
+    target_kl: float = 0.05
+    """An update leaves out the rest of its optimiser steps once the policy, by the samples of a minibatch,
+    is further than 1.5 times this from the one that acted (nats); not while it imitates. 0: never."""
     entropy_coefficient: float = 0.0
     """Weight of the entropy bonus."""
     value_coefficient: float = 0.5
@@ -123,7 +129,19 @@ class TrainConfig:
     @property
     def piece_size(self) -> int:
         """Samples per piece of a gradient: `microbatch`, or the largest divisor that suits the encoder."""
-        return self.microbatch or math.gcd(self.minibatch_size, PIECE_SIZES.get(self.encoder, 32))
+        own = self.minibatch_size // max(1, self.devices)
+        return self.microbatch or math.gcd(own, PIECE_SIZES.get(self.encoder, 32))
+
+    @property
+    def group_size(self) -> int:
+        """Environments whose samples are shuffled together: the fewest that give every minibatch as many."""
+        divisors = (size for size in range(1, self.num_envs + 1) if self.num_envs % size == 0)
+        return next(size for size in divisors if size * self.rollout_steps % self.num_minibatches == 0)
+
+    def shares_equally(self, devices: int) -> bool:
+        """Whether so many devices can share groups of environments, and pieces of minibatches."""
+        groups, pieces = self.num_envs // self.group_size, self.minibatch_size // (self.microbatch or 1)
+        return groups % devices == 0 and pieces % devices == 0
 
     @property
     def warm_start_updates(self) -> int:
@@ -139,7 +157,7 @@ class TrainConfig:
 _AT_LEAST_ONE = ("total_steps", "num_envs", "rollout_steps", "epochs", "num_minibatches")
 _SHARES = ("gamma", "gae_lambda")
 _POSITIVE = ("learning_rate", "warm_start_learning_rate", "clip", "max_grad_norm", "reward_scale")
-_NOT_NEGATIVE = ("entropy_coefficient", "value_coefficient")
+_NOT_NEGATIVE = ("target_kl", "entropy_coefficient", "value_coefficient")
 
 
 def check(config: TrainConfig) -> None:
@@ -157,7 +175,7 @@ def check(config: TrainConfig) -> None:
     _require(config, "warm_start", config.warm_start in teachers, f"one of {', '.join(teachers)}")
     in_range = 0 <= config.seed <= LARGEST_SEED
     _require(config, "seed", in_range, f"an integer in [0, {LARGEST_SEED}]")
-    for name in ("evaluation_episodes", "warm_start_steps", "pretrain_steps", "microbatch"):
+    for name in ("evaluation_episodes", "warm_start_steps", "pretrain_steps", "microbatch", "devices"):
         _require(config, name, getattr(config, name) >= 0, "an integer >= 0")
     if config.encoder not in ENCODERS:
         _require(config, "head", config.head == "beams", f"beams, the head of {config.encoder}")
@@ -203,6 +221,10 @@ def _check_batches(config: TrainConfig) -> None:
         config.minibatch_size % config.piece_size == 0,
         f"a divisor of the minibatch of {config.minibatch_size} samples",
     )
+    groups, pieces = config.num_envs // config.group_size, config.minibatch_size // (config.microbatch or 1)
+    shares = config.shares_equally(max(1, config.devices))
+    divided = f"{groups} groups of environments and {pieces} pieces of a minibatch"
+    _require(config, "devices", shares, f"0, or a divisor of {divided}")
     _require(config, "total_steps", config.num_updates >= 1, f"at least one update: >= {samples}")
 
 

@@ -9,7 +9,7 @@ from train.tables import read_number, table_option
 COLUMNS = (
     *("reward", "episode_return", "completeness", "covariance_norm_mean", "covariance_norm_sum"),
     *("live_tracks", "mean_scan_value", "policy_loss", "value_loss", "entropy", "approximate_kl"),
-    *("clip_fraction", "gradient_norm", "explained_variance"),
+    *("clip_fraction", "steps_taken", "gradient_norm", "explained_variance"),
 )
 """Columns that every training has and that can end one; `info_metrics` of the environment are more."""
 

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 from flax import linen as nn
 
+from train.gru import Weights, gru
 from train.orthogonal import orthogonal
 from train.vision import GAIN
 
@@ -80,12 +81,7 @@ class SelfAttention(nn.Module):
 
 
 class GRU(nn.Module):
-    """Final state of a gated recurrent unit that passes over rows outside the mask.
-
-    Formulas and bias placement of PyTorch's `GRU` and flax's `GRUCell`:
-    ``r, z = sigmoid(W_r x + U_r h), sigmoid(W_z x + U_z h)``,
-    ``n = tanh(W_n x + r (U_n h + c))``, ``h' = (1 - z) n + z h``.
-    """
+    """Final state of a gated recurrent unit that passes over rows outside the mask (`train.gru`)."""
 
     hidden: int
     reverse: bool = False
@@ -94,37 +90,14 @@ class GRU(nn.Module):
     @nn.compact
     def __call__(self, x: jax.Array, mask: jax.Array) -> jax.Array:
         """Maps rows `[B, T, F]` and mask `[B, T]` to the final state `[B, hidden]`; 0 if empty."""
-        # All time steps at once: one large product instead of T small ones in the scan.
-        inputs = nn.Dense(3 * self.hidden, kernel_init=_per_gate(nn.initializers.xavier_uniform()))(x)
-        shape = (self.hidden, 3 * self.hidden)
-        kernel = self.param("recurrent_kernel", _per_gate(orthogonal()), shape)
-        bias = self.param("recurrent_bias", nn.initializers.zeros, (self.hidden,))
-
-        def step(state: jax.Array, row: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, None]:
-            inputs, inside = row
-            updated = gru_update(state, inputs, kernel, bias)
-            return jnp.where(inside[:, None], updated, state), None
-
-        state = jnp.zeros((x.shape[0], self.hidden), inputs.dtype)
-        rows = (jnp.swapaxes(inputs, 0, 1), mask.T)
-        return jax.lax.scan(step, state, rows, reverse=self.reverse)[0]
-
-
-def gru_update(state: jax.Array, inputs: jax.Array, kernel: jax.Array, bias: jax.Array) -> jax.Array:
-    """Next state of a GRU.
-
-    Args:
-        state: `[B, H]`.
-        inputs: `[B, 3 H]` input projections with their biases, gates in the order r, z, n.
-        kernel: `[H, 3 H]` recurrent weights, gates in the same order.
-        bias: `[H]` of the recurrent part of n.
-    """
-    input_r, input_z, input_n = jnp.split(inputs, 3, axis=-1)
-    state_r, state_z, state_n = jnp.split(state @ kernel, 3, axis=-1)
-    reset = nn.sigmoid(input_r + state_r)
-    keep = nn.sigmoid(input_z + state_z)
-    candidate = jnp.tanh(input_n + reset * (state_n + bias[None, :]))
-    return (1 - keep) * candidate + keep * state
+        wide, glorot = 3 * self.hidden, nn.initializers.xavier_uniform()
+        weights = Weights(
+            kernel=self.param("kernel", _per_gate(glorot), (x.shape[-1], wide)),
+            bias=self.param("bias", nn.initializers.zeros, (wide,)),
+            recurrent_kernel=self.param("recurrent_kernel", _per_gate(orthogonal()), (self.hidden, wide)),
+            recurrent_bias=self.param("recurrent_bias", nn.initializers.zeros, (self.hidden,)),
+        )
+        return gru(weights, jnp.swapaxes(x, 0, 1), mask.T, self.reverse)
 
 
 def zero_padding(tracks: jax.Array, mask: jax.Array) -> jax.Array:

@@ -3,71 +3,24 @@
 Plain functions with explicit arguments; `train_step` is the table of contents.
 """
 
-from collections.abc import Callable
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import optax
-from flax import struct
 
 from jaxtrack.env import SearchTrack
-from jaxtrack.episode import EnvState
 from jaxtrack.params import Params
-from jaxtrack.policies import POLICIES
 from train.agents import Agent, build_agent
 from train.config import TrainConfig
+from train.devices import ALONE, Share
 from train.gae import advantages
+from train.learner_state import LearnerState
 from train.loss import Sample, explained_variance
 from train.pieces import minibatch_gradient, shortest_first
 from train.pretrain import pretrain
+from train.rollout import Transition, collect
 from train.varied import randomised, scenario_at
-
-Chooser = Callable[[jax.Array, EnvState, jax.Array], jax.Array]
-"""Key, states of the environments, and logits to actions `[B, 2]`."""
-
-LOGGED = ("completeness", "covariance_norm_mean", "covariance_norm_sum", "live_tracks", "mean_scan_value")
-
-
-class LearnerState(struct.PyTreeNode):
-    """Everything that training carries from one update to the next, B environments.
-
-    Attributes:
-        weights: variables of the network.
-        optimiser: state of Adam.
-        env: states of the environments.
-        inputs: network inputs of the current observations.
-        episode_return: `[B]` reward summed since the episode began.
-        episode_length: `[B]` steps since the episode began.
-        scenario: numbers of the environment; traced, so that changing them recompiles nothing. What
-            a curriculum moves is as in the last update.
-        key: random key data.
-        update: `[]` updates done.
-    """
-
-    weights: Any
-    optimiser: Any
-    env: EnvState
-    inputs: Any
-    episode_return: jax.Array
-    episode_length: jax.Array
-    scenario: Params
-    key: jax.Array
-    update: jax.Array
-
-
-class Transition(struct.PyTreeNode):
-    """One step of B environments, as the update needs it (`[B, ...]`, stacked to `[S, B, ...]`)."""
-
-    inputs: Any
-    action: jax.Array
-    taught: jax.Array
-    log_prob: jax.Array
-    value: jax.Array
-    final_value: jax.Array
-    reward: jax.Array
-    terminated: jax.Array
-    done: jax.Array
 
 
 def make_optimiser(config: TrainConfig) -> optax.GradientTransformation:
@@ -116,97 +69,29 @@ def init_learner(key: jax.Array, scenario: Params, env: SearchTrack, config: Tra
 
 
 def train_step(
-    state: LearnerState, env: SearchTrack, config: TrainConfig
+    state: LearnerState, env: SearchTrack, config: TrainConfig, share: Share = ALONE
 ) -> tuple[LearnerState, dict[str, jax.Array]]:
-    """One update: a rollout of every environment, advantages, and PPO's epochs over them."""
+    """One update: a rollout of every environment, advantages, and PPO's epochs over them.
+
+    Args:
+        state: on each of several devices with its own environments.
+        env: the environment.
+        config: of the whole training.
+        share: what this device does of it.
+    """
     env = randomised(env, config)
     state = state.replace(scenario=scenario_at(state.update, state.scenario, config))
     agent = build_agent(config.encoder, env.static, state.scenario, config.head)
     key, key_rollout, key_update = jax.random.split(jax.random.wrap_key_data(state.key), 3)
-    state, rollout, rollout_metrics = collect(key_rollout, state, env, agent, config)
+    state, rollout, rollout_metrics = collect(key_rollout, state, env, agent, config, share)
     samples = estimate_advantages(rollout, state, agent, config)
-    weights, optimiser, losses = update_epochs(key_update, state, samples, agent, config)
+    weights, optimiser, losses = update_epochs(key_update, state, samples, agent, config, share)
     state = state.replace(
         weights=weights, optimiser=optimiser, key=jax.random.key_data(key), update=state.update + 1
     )
-    explained = explained_variance(samples.value, samples.advantage)
+    explained = explained_variance(*share.all((samples.value, samples.advantage), axis=1))
     moved = {name: getattr(state.scenario, name) for name in config.curriculum}
     return state, {**rollout_metrics, **losses, "explained_variance": explained, **moved}
-
-
-def collect(
-    key: jax.Array, state: LearnerState, env: SearchTrack, agent: Agent, config: TrainConfig
-) -> tuple[LearnerState, Transition, dict[str, jax.Array]]:
-    """Runs every environment for `rollout_steps` steps with the current weights."""
-    choose = build_chooser(state, env, agent, config)
-    taught = jnp.full(config.num_envs, state.update < config.warm_start_updates)
-
-    def one_step(carry: LearnerState, key: jax.Array) -> tuple[LearnerState, tuple[Transition, Any, Any]]:
-        key_action, key_env = jax.random.split(key)
-        logits, value = agent.evaluate_quickly(carry.weights, carry.inputs)
-        action = choose(key_action, carry.env, logits)
-        keys = jax.random.split(key_env, config.num_envs)
-        observation, env_state, reward, terminated, truncated, info = jax.vmap(
-            env.step, in_axes=(0, 0, 0, None)
-        )(keys, carry.env, action, state.scenario)
-        done = terminated | truncated
-        transition = Transition(
-            inputs=carry.inputs,
-            action=action,
-            taught=taught,
-            log_prob=agent.distribution.log_prob(logits, action),
-            value=value,
-            final_value=value_at_end(carry.weights, info["final_observation"], done, agent),
-            reward=config.reward_scale * reward,
-            terminated=terminated,
-            done=done,
-        )
-        episode_return, episode_length = carry.episode_return + reward, carry.episode_length + 1
-        finished = {"done": done, "episode_return": episode_return, "episode_length": episode_length}
-        logged = {"reward": reward} | {name: info[name] for name in (*LOGGED, *env.static.info_metrics)}
-        carry = carry.replace(
-            env=env_state,
-            inputs=jax.vmap(agent.features)(observation),
-            episode_return=jnp.where(done, 0.0, episode_return),
-            episode_length=jnp.where(done, 0, episode_length),
-        )
-        return carry, (transition, finished | {"terminated": terminated}, logged)
-
-    keys = jax.random.split(key, config.rollout_steps)
-    state, (rollout, finished, logged) = jax.lax.scan(one_step, state, keys)
-    return state, rollout, summarise(finished, logged, state.scenario)
-
-
-def build_chooser(state: LearnerState, env: SearchTrack, agent: Agent, config: TrainConfig) -> Chooser:
-    """How actions are chosen: by the policy, or in the first updates by the rule that it imitates."""
-
-    def by_policy(key: jax.Array, states: EnvState, logits: jax.Array) -> jax.Array:
-        del states
-        return agent.distribution.sample(key, logits)
-
-    if not config.warm_start_updates:
-        return by_policy
-    rule = POLICIES[config.warm_start](env.static, state.scenario)
-
-    def by_rule(key: jax.Array, states: EnvState, logits: jax.Array) -> jax.Array:
-        del logits
-        return jax.vmap(rule)(jax.random.split(key, config.num_envs), states)
-
-    imitates = state.update < config.warm_start_updates
-    return lambda *now: jax.lax.cond(imitates, by_rule, by_policy, *now)
-
-
-def value_at_end(weights: Any, final_observation: Any, done: jax.Array, agent: Agent) -> jax.Array:
-    """Value `[B]` of the final observations; 0 where the episode goes on.
-
-    Most steps end no episode: then nothing is computed.
-    """
-
-    def evaluate() -> jax.Array:
-        _, value = agent.evaluate(weights, jax.vmap(agent.features)(final_observation))
-        return jnp.where(done, value, 0.0)
-
-    return jax.lax.cond(jnp.any(done), evaluate, lambda: jnp.zeros(done.shape))
 
 
 def estimate_advantages(
@@ -228,39 +113,48 @@ def estimate_advantages(
 
 
 def update_epochs(
-    key: jax.Array, state: LearnerState, samples: Sample, agent: Agent, config: TrainConfig
+    key: jax.Array, state: LearnerState, samples: Sample, agent: Agent, config: TrainConfig, share: Share
 ) -> tuple[Any, Any, dict[str, jax.Array]]:
-    """PPO's epochs: each shuffles all samples and takes an optimiser step per minibatch."""
-    flat = jax.tree.map(lambda leaf: leaf.reshape(config.batch_size, *leaf.shape[2:]), samples)
+    """PPO's epochs: each shuffles all samples and takes an optimiser step per minibatch.
+
+    Once the policy has gone too far (`target_kl`) no step is taken any more, as in Stable-Baselines3.
+    """
+    flat = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), samples)
     optimiser = make_optimiser(config)
 
-    def one_minibatch(carry: tuple[Any, Any], rows: jax.Array) -> tuple[tuple[Any, Any], Any]:
-        weights, optimiser_state = carry
+    imitates = state.update < config.warm_start_updates
+    farthest = jnp.where(imitates, jnp.inf, 1.5 * config.target_kl or jnp.inf)
+
+    def one_minibatch(carry: tuple[Any, Any, jax.Array], rows: jax.Array) -> tuple[Any, Any]:
+        weights, optimiser_state, near = carry
         rows = shortest_first(rows, flat.inputs, agent)
-        minibatch = jax.tree.map(lambda leaf: leaf[rows], flat)
-        grads, losses = minibatch_gradient(weights, minibatch, agent, config)
-        updates, optimiser_state = optimiser.update(grads, optimiser_state, weights)
-        losses["gradient_norm"] = optax.tree.norm(grads)
-        return (optax.apply_updates(weights, updates), optimiser_state), losses
+        grads, losses = minibatch_gradient(weights, flat, rows, agent, config, share)
+        near &= losses["approximate_kl"] <= farthest
+        updates, moved = optimiser.update(grads, optimiser_state, weights)
+        taken = (optax.apply_updates(weights, updates), moved)
+        kept = jax.tree.map(lambda new, old: jnp.where(near, new, old), taken, (weights, optimiser_state))
+        return (*kept, near), losses | {"gradient_norm": optax.tree.norm(grads), "steps_taken": near * 1.0}
 
-    def one_epoch(carry: tuple[Any, Any], key: jax.Array) -> tuple[tuple[Any, Any], Any]:
-        order = jax.random.permutation(key, config.batch_size)
-        return jax.lax.scan(one_minibatch, carry, order.reshape(config.num_minibatches, -1))
+    def one_epoch(carry: Any, key: jax.Array) -> tuple[Any, Any]:
+        return jax.lax.scan(one_minibatch, carry, shuffled(key, config, share))
 
-    carry = (state.weights, state.optimiser)
-    carry, losses = jax.lax.scan(one_epoch, carry, jax.random.split(key, config.epochs))
-    return *carry, jax.tree.map(jnp.mean, losses)
+    carry = (state.weights, state.optimiser, jnp.asarray(True))
+    (weights, moments, _), losses = jax.lax.scan(one_epoch, carry, jax.random.split(key, config.epochs))
+    return weights, moments, jax.tree.map(jnp.mean, losses)
 
 
-def summarise(
-    finished: dict[str, jax.Array], logged: dict[str, jax.Array], params: Params
-) -> dict[str, jax.Array]:
-    """Means over a rollout; episode returns over whole episodes only, NaN where none ended."""
-    # The first episodes are cut short by the different times at which they start.
-    whole = finished["done"] & (
-        finished["terminated"] | (finished["episode_length"] == params.max_steps_in_episode)
+def shuffled(key: jax.Array, config: TrainConfig, share: Share) -> jax.Array:
+    """Rows `[minibatches, M]` of this device's samples, the rows of a rollout `[S, B]` of its own.
+
+    Every group of environments gives as many samples to every minibatch, so that devices share
+    all of them, and no sample goes from one device to another.
+    """
+    size = config.group_size
+    keys = share.own(jax.random.split(key, config.num_envs // size))
+    order = jax.vmap(lambda key: jax.random.permutation(key, size * config.rollout_steps))(keys)
+    step, member = jnp.divmod(order, size)
+    group = jnp.arange(len(keys))[:, None]
+    rows = step * (len(keys) * size) + group * size + member
+    return (
+        rows.reshape(len(keys), config.num_minibatches, -1).swapaxes(0, 1).reshape(config.num_minibatches, -1)
     )
-    count = whole.sum()
-    total = jnp.where(whole, finished["episode_return"], 0.0).sum()
-    means = {name: values.mean() for name, values in logged.items()}
-    return {**means, "episodes": count, "episode_return": jnp.where(count > 0, total / count, jnp.nan)}

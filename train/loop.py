@@ -13,9 +13,11 @@ from jaxtrack.env import SearchTrack
 from jaxtrack.params import Params
 from train import learner
 from train.checkpoint import learner_shapes
+from train.config import TrainConfig
+from train.devices import Share, places, share_out, with_devices
 from train.display import TrainingBar
 from train.interrupt import Interrupt, exit_code
-from train.learner import LearnerState
+from train.learner_state import LearnerState
 from train.run_folder import Run
 
 FAILED = 1
@@ -30,30 +32,46 @@ class Programs(NamedTuple):
     Attributes:
         init: key of a seed, and params, to the first learner state; compiled when first called.
         step: learner state to the next one and its metrics; compiled. The state it is given is gone.
+        places: on which devices the arrays of the state lie; None: on the first.
     """
 
     init: Callable[[jax.Array, Params], LearnerState]
     step: Callable[[LearnerState], tuple[LearnerState, dict[str, jax.Array]]]
+    places: Any = None
+
+
+def jit_training(env: Any, config: TrainConfig) -> tuple[Programs, LearnerState]:
+    """What a training runs, not compiled yet, and the shapes of the learner state to compile its step for."""
+    # From shapes alone, so that a resumed run compiles the very same program.
+    shapes = learner_shapes(env, config)
+    rows, number = shapes.of_environments(), config.devices
+    where = places(rows, number)
+    init = jax.jit(lambda key, params: learner.init_learner(key, params, env, config), out_shardings=where)
+    step = share_out(lambda state: learner.train_step(state, env, config, Share(number)), rows, number)
+    placed = jax.tree.map(
+        lambda leaf, place: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=place), shapes, where
+    )
+    return Programs(init, jax.jit(step, donate_argnums=0), where), placed
 
 
 def compile_training(run: Run, env: SearchTrack, console: Console) -> Programs:
     """Compiles, and says how long it took; what makes the first state only if the run has none yet."""
-    started, config = time.perf_counter(), run.config
-    init: Any = jax.jit(lambda key, params: learner.init_learner(key, params, env, config))
+    started, config = time.perf_counter(), with_devices(run.config)
+    jitted: Any
+    jitted, shapes = jit_training(env, config)
+    init = jitted.init
     with console.status("compiling (about half a minute)"):
         if run.state is None:
             init = init.lower(jax.random.key(config.seed), config.params).compile()
-        step = jax.jit(lambda state: learner.train_step(state, env, config), donate_argnums=0)
-        # From shapes alone, so that a resumed run compiles the very same program.
-        compiled = step.lower(learner_shapes(env, config)).compile()
-    console.print(f"compiled in {time.perf_counter() - started:.1f} s")
-    return Programs(init, compiled)
+        step = jitted.step.lower(shapes).compile()
+    console.print(f"compiled in {time.perf_counter() - started:.1f} s, for {config.devices} devices")
+    return Programs(init, step, jitted.places)
 
 
 def first_state(run: Run, programs: Programs) -> LearnerState:
     """The learner state of the run's checkpoint, or a fresh one."""
     if run.state is not None:
-        return run.state
+        return jax.device_put(run.state, programs.places)
     return programs.init(jax.random.key(run.config.seed), run.config.params)
 
 

@@ -9,8 +9,10 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from jaxtrack.kernel import stage
 from train.agents import Agent
 from train.config import TrainConfig
+from train.devices import ALONE, Share
 from train.loss import Sample, ppo_loss
 
 
@@ -28,28 +30,38 @@ def shortest_first(rows: jax.Array, inputs: Any, agent: Agent) -> jax.Array:
 
 
 def minibatch_gradient(
-    weights: Any, minibatch: Sample, agent: Agent, config: TrainConfig
+    weights: Any, samples: Sample, rows: jax.Array, agent: Agent, config: TrainConfig, share: Share = ALONE
 ) -> tuple[Any, dict[str, jax.Array]]:
-    """Gradient of the loss over a minibatch, and what the loss reports, as means over its pieces."""
-    spread = minibatch.advantage.std() + 1e-8
-    normalised = (minibatch.advantage - minibatch.advantage.mean()) / spread
-    target = minibatch.value + minibatch.advantage
-    pieces = config.minibatch_size // config.piece_size
-    split = jax.tree.map(
-        lambda leaf: leaf.reshape(pieces, config.piece_size, *leaf.shape[1:]),
-        (minibatch, normalised, target),
-    )
+    """Gradient of the loss over a minibatch, and what the loss reports, as means over its pieces.
 
-    def gradient(piece: tuple[Sample, jax.Array, jax.Array]) -> Any:
-        return piece_gradient(weights, *piece, agent, config)
+    Args:
+        weights: of the network.
+        samples: all of this device.
+        rows: `[M]` those of them that are in the minibatch.
+        agent: the agent.
+        config: of the whole training.
+        share: what this device does of it.
+    """
+    advantages = share.all(samples.advantage[rows])
+    mean, spread = advantages.mean(), advantages.std() + 1e-8
+    pieces = rows.reshape(-1, config.piece_size)
 
-    def add_piece(total: Any, piece: Any) -> tuple[Any, None]:
-        return jax.tree.map(jnp.add, total, gradient(piece)), None
+    def of_piece(weights: Any, samples: Sample, advantage: jax.Array, target: jax.Array) -> Any:
+        return piece_gradient(weights, samples, advantage, target, agent, config)
 
-    shapes = jax.eval_shape(gradient, jax.tree.map(lambda leaf: leaf[0], split))
+    def gradient(rows: jax.Array) -> Any:
+        piece = jax.tree.map(lambda leaf: leaf[rows], samples)
+        target = piece.value + piece.advantage
+        # A stage: where samples are taken must not merge with what lays out patches of their maps.
+        return stage(of_piece)(weights, piece, (piece.advantage - mean) / spread, target)
+
+    def add_piece(total: Any, rows: jax.Array) -> tuple[Any, None]:
+        return jax.tree.map(jnp.add, total, gradient(rows)), None
+
+    shapes = jax.eval_shape(gradient, pieces[0])
     zeros = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
-    total, _ = jax.lax.scan(add_piece, zeros, split)
-    return jax.tree.map(lambda leaf: leaf / pieces, total)
+    total, _ = jax.lax.scan(add_piece, zeros, pieces)
+    return jax.tree.map(lambda leaf: leaf / (len(pieces) * share.number), share.add(total))
 
 
 def piece_gradient(

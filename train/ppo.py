@@ -1,5 +1,10 @@
 """The main job: `python -m train.ppo` trains an agent, evaluates it, and draws what it learned."""
 
+from jaxtrack import cores
+
+if __name__ == "__main__":
+    cores.use()  # before gymnax is imported, which starts JAX
+
 import dataclasses
 import shlex
 import sys
@@ -19,7 +24,7 @@ from train.config import TrainConfig, from_dict, to_dict
 from train.display import TrainingBar, print_config
 from train.evaluate import COMPARED_SEED, agent, compare_with_baselines
 from train.interrupt import Interrupt, exit_code
-from train.learner import LearnerState
+from train.learner_state import LearnerState
 from train.loop import FAILED, compile_training, first_state, train
 from train.recorded import with_recording
 from train.results import print_results, summarise, write_results
@@ -176,7 +181,7 @@ def execute_seeds(seeds: Seeds, console: Console) -> int:
                     print(f"continue with: {seeds.resume_command}")
                 return exit_code(interrupt.signal)
             if code == 0:
-                weights[seed] = state.weights
+                weights[seed] = jax.device_get(state.weights)
         if programs is None:
             left = "what follows it had not" if seeds.evaluation_episodes else "nothing is left to do"
             console.print(f"the training had finished, {left}")
@@ -199,7 +204,7 @@ def finish_seeds(weights: dict[int, Any], env: SearchTrack, seeds: Seeds, consol
 
 def finish(state: LearnerState, env: SearchTrack, run: Run, console: Console) -> None:
     """Evaluates the trained agent against the baselines; draws pictures and writes tables."""
-    evaluate_agent({run.config.seed: state.weights}, env, run, [run.folder], console)
+    evaluate_agent({run.config.seed: jax.device_get(state.weights)}, env, run, [run.folder], console)
 
 
 def evaluate_agent(

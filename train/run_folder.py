@@ -9,8 +9,9 @@ from pathlib import Path
 
 from train.checkpoint import Checkpoint, save, written_with
 from train.config import TrainConfig, check, first_difference, to_dict
+from train.devices import with_devices
 from train.early_stop import passed
-from train.learner import LearnerState
+from train.learner_state import LearnerState
 from train.metrics_file import MetricsFile
 from train.saved_run import read_config, read_run, write_config
 
@@ -84,6 +85,7 @@ def start_run(config: TrainConfig) -> Iterator[Run]:
         OSError: if the folder can not be made.
     """
     check(config)
+    config = with_devices(config)
     name = f"runs/{config.encoder}-seed{config.seed}-{time.strftime('%Y%m%d-%H%M%S')}"
     folder = Path(config.out or name)
     folder.mkdir(parents=True, exist_ok=False)

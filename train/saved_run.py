@@ -17,7 +17,7 @@ from train.checkpoint import (
     write,
 )
 from train.config import TrainConfig, check, first_difference, from_dict, to_dict
-from train.learner import LearnerState
+from train.learner_state import LearnerState
 from train.recorded import with_recording
 from train.sealed import read_json, write_whole
 

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from jaxtrack.cli import LARGEST_SEED, require_integer
 from train.config import TrainConfig, check, first_difference, from_dict, to_dict
+from train.devices import with_devices
 from train.recorded import with_recording
 from train.run_folder import Run, resume_command, resume_run, start_run
 from train.saved_run import read_config
@@ -97,6 +98,7 @@ def start_seeds(config: TrainConfig, number: int) -> Iterator[Seeds]:
         OSError: if the folder can not be made.
     """
     check(config)
+    config = with_devices(config)
     require_integer("seeds", number, 1, LARGEST_SEED + 1 - config.seed)
     seeds = f"seeds{config.seed}-{config.seed + number - 1}"
     folder = Path(config.out or f"runs/{config.encoder}-{seeds}-{time.strftime('%Y%m%d-%H%M%S')}")

@@ -87,8 +87,8 @@ def convolve_by_xla(images: jax.Array, kernel: jax.Array, stride: int) -> jax.Ar
 def convolve_by_matmul(images: jax.Array, kernel: jax.Array, stride: int) -> jax.Array:
     """The same convolution as one matrix product; `stride` must divide the kernel's size.
 
-    Pixels are gathered into blocks of stride x stride. On blocks the kernel has stride 1 and
-    k / stride taps per axis; shifted copies of the blocks, one per tap, lie side by side.
+    Columns are taken in strips of `stride`, whose numbers lie side by side in memory. A patch is k rows
+    of k / stride such strips, in the order in which the kernel's weights lie.
 
     Raises:
         ValueError: if the stride does not divide the size of the kernel.
@@ -98,18 +98,12 @@ def convolve_by_matmul(images: jax.Array, kernel: jax.Array, stride: int) -> jax
         raise ValueError(f"stride = {stride}: expected a divisor of the kernel size {size}")
     batch, height, width, _ = images.shape
     rows, columns, taps = (height - size) // stride + 1, (width - size) // stride + 1, size // stride
-    block_rows, block_columns = rows + taps - 1, columns + taps - 1
-    depth = stride * stride * channels
-
-    used = images[:, : block_rows * stride, : block_columns * stride]
-    blocks = used.reshape(batch, block_rows, stride, block_columns, stride, channels)
-    blocks = blocks.transpose(0, 1, 3, 2, 4, 5).reshape(batch, block_rows, block_columns, depth)
-    shifted = [blocks[:, i : i + rows, j : j + columns] for i in range(taps) for j in range(taps)]
-
-    weights = kernel.reshape(taps, stride, taps, stride, channels, features)
-    weights = weights.transpose(0, 2, 1, 3, 4, 5).reshape(taps * taps * depth, features)
-    patches = jnp.concatenate(shifted, axis=-1).reshape(-1, taps * taps * depth)
-    return tall_product(patches, weights).reshape(batch, rows, columns, features)
+    used = images[:, :, : (columns + taps - 1) * stride]
+    strips = used.reshape(batch, height, columns + taps - 1, stride * channels)
+    last = (rows - 1) * stride + 1
+    parts = [strips[:, i : i + last : stride, j : j + columns] for i in range(size) for j in range(taps)]
+    patches = jnp.concatenate(parts, axis=-1).reshape(-1, size * size * channels)
+    return tall_product(patches, kernel.reshape(-1, features)).reshape(batch, rows, columns, features)
 
 
 @jax.custom_vjp

@@ -6,7 +6,7 @@ from flax import linen as nn
 from flax import struct
 
 from jaxtrack import StaticParams
-from train import learner
+from train.rollout import LOGGED
 
 LOOKS = 2
 
@@ -41,7 +41,7 @@ class Probe:
         end = after.time == self.length
         final, (_, first) = self.observe(after), self.reset_env(key_reset, params)
         state = jax.tree.map(lambda new, old: jnp.where(end, new, old), first, after)
-        info = {"final_observation": final, **{name: reward for name in learner.LOGGED}}
+        info = {"final_observation": final, **{name: reward for name in LOGGED}}
         terminated, truncated = end & self.terminates, end & (not self.terminates)
         return self.observe(state), state, reward, terminated, truncated, info
 

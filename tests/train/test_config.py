@@ -49,7 +49,9 @@ def test_seeds_have_32_bits(seed):
     assert refusal(seed=seed) == f"seed = {seed}: expected an integer in [0, 4294967295]"
 
 
-@pytest.mark.parametrize("name", ["warm_start_steps", "evaluation_episodes", "microbatch", "pretrain_steps"])
+@pytest.mark.parametrize(
+    "name", ["warm_start_steps", "evaluation_episodes", "microbatch", "pretrain_steps", "devices"]
+)
 def test_counts_that_may_be_zero_are_not_negative(name):
     assert refusal(**{name: -1}) == f"{name} = -1: expected an integer >= 0"
     check(TrainConfig(**{**SMALL, name: 0}))
@@ -88,11 +90,20 @@ def test_scales_are_positive(name):
         assert refusal(**{name: value}) == f"{name} = {value}: expected a number > 0"
 
 
-@pytest.mark.parametrize("name", ["entropy_coefficient", "value_coefficient"])
+@pytest.mark.parametrize("name", ["entropy_coefficient", "value_coefficient", "target_kl"])
 def test_coefficients_are_not_negative(name):
     for value in (-1.0, NAN, INF):
         assert refusal(**{name: value}) == f"{name} = {value}: expected a number >= 0"
     check(TrainConfig(**{**SMALL, name: 0.0}))
+
+
+def test_devices_share_equally():
+    for number in (3, 4):  # environments could be shared among 4, the two pieces of 8 samples not
+        assert refusal(devices=number) == (
+            f"devices = {number}: expected 0, or a divisor of 4 groups of environments and 2 pieces of a "
+            "minibatch"
+        )
+    check(TrainConfig(**{**SMALL, "devices": 2}))
 
 
 def test_batches_divide():

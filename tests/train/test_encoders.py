@@ -93,7 +93,7 @@ def test_gru_equals_flax_cell_on_the_rows_inside_the_mask(apply, draw_variables,
 def flax_cell_variables(params, hidden):
     def gate(index, recurrent_bias):
         part = slice(index * hidden, (index + 1) * hidden)
-        inputs = {name: array[..., part] for name, array in params["Dense_0"].items()}
+        inputs = {name: array[..., part] for name, array in params.items() if name in ("kernel", "bias")}
         return inputs, {"kernel": params["recurrent_kernel"][:, part]} | recurrent_bias
 
     cell = {}

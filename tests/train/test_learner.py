@@ -6,14 +6,17 @@ import math
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 import pytest
 
 from jaxtrack import Params
+from jaxtrack.policies import POLICIES
 from tests.train.probes import Linear, Probe, ProbeState, at_the_end, constant, right_look
 from train import learner
 from train.agents import Agent
 from train.config import TrainConfig
 from train.distributions import JOINT
+from train.rollout import collect
 
 pytestmark = pytest.mark.usefixtures("quick_compilation")
 
@@ -28,6 +31,7 @@ CONFIG = TrainConfig(
     warm_start_learning_rate=0.03,
     anneal=False,
     gamma=0.5,
+    target_kl=0.0,
     entropy_coefficient=0.0,
     reward_scale=1.0,
     warm_start="none",
@@ -123,17 +127,17 @@ def test_at_first_a_rule_is_imitated_whatever_it_earns(traced, monkeypatch):
         # The right look is the wrong one here.
         return lambda key, state: jnp.where(state.coin == 1, jnp.array([0, 1]), jnp.array([1, 0]))
 
-    monkeypatch.setitem(learner.POLICIES, "wrong", rule)
+    monkeypatch.setitem(POLICIES, "wrong", rule)
     probe = Probe(right_look, 4)
-    config = config_for(probe, warm_start="wrong", warm_start_steps=30 * CONFIG.batch_size + 1)
-    assert config.warm_start_updates == 30
-    _, metrics = learn(probe, config, 90)
-    assert (metrics["reward"][:30] == 0).all()
+    config = config_for(probe, warm_start="wrong", warm_start_steps=12 * CONFIG.batch_size + 1)
+    assert config.warm_start_updates == 12
+    _, metrics = learn(probe, config, 72)
+    assert (metrics["reward"][:12] == 0).all()
     # The policy loss is the cross-entropy with the rule.
     np.testing.assert_allclose(metrics["policy_loss"][0], math.log(4), atol=0.3)
-    assert metrics["policy_loss"][29] < 0.3
+    assert metrics["policy_loss"][11] < 0.3
     # On its own it does at first what it was taught, and then learns what pays.
-    assert metrics["reward"][30] < 0.3
+    assert metrics["reward"][12] < 0.3
     assert metrics["reward"][-1] > 0.9
 
 
@@ -148,7 +152,7 @@ def test_the_final_value_counts_exactly_where_an_episode_is_truncated(traced, te
 
     @jax.jit
     def roll(state):
-        after, rollout, _ = learner.collect(jax.random.key(0), state, probe, agent, config)
+        after, rollout, _ = collect(jax.random.key(0), state, probe, agent, config)
         return rollout, learner.estimate_advantages(rollout, after, agent, config)
 
     rollout, samples = roll(state)
@@ -197,6 +201,22 @@ def test_fresh_samples_have_ratio_one_until_the_first_optimiser_step(traced):
     moved = first_update(state, 0.3)
     assert moved["approximate_kl"] > 1e-3
     assert 0 < moved["clip_fraction"] < 1
+
+
+@pytest.mark.parametrize(("rule", "steps"), [("none", 1), ("scheduler", 8)])
+def test_an_update_ends_where_the_policy_has_gone_too_far_but_for_imitation(traced, monkeypatch, rule, steps):
+    monkeypatch.setitem(POLICIES, rule, lambda static, params: lambda key, state: jnp.array([0, 1]))
+    probe = Probe(right_look, 4)
+    config = config_for(probe, target_kl=1e-9, warm_start=rule, warm_start_steps=CONFIG.batch_size)
+    before = start(probe, config)
+    after, metrics = jax.jit(lambda state: learner.train_step(state, probe, config))(before)
+    # Fresh samples have a divergence of 0, so the first of 4 x 2 steps is taken.
+    np.testing.assert_allclose(metrics["steps_taken"], steps / 8)
+    counts = [int(count) for _, count in optax.tree.get_all_with_path(after.optimiser, "count")]
+    assert counts
+    assert set(counts) == {steps}
+    changed = jax.tree.map(lambda a, b: np.any(a != b), after.weights, before.weights)
+    assert any(jax.tree.leaves(changed))
 
 
 def test_the_step_is_traced_once_and_other_numbers_retrace_nothing(traced):

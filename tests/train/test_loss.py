@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from jaxtrack import Params
-from train import learner
+from train import learner, rollout
 from train.agents import Agent
 from train.beams import BeamInputs, BeamNetwork
 from train.config import TrainConfig
@@ -122,7 +122,9 @@ def test_the_microbatch_changes_nothing(draw_variables):
     @jax.jit
     def gradients(weights):
         in_pieces = [
-            minibatch_gradient(weights, samples, agent, dataclasses.replace(config, microbatch=size))
+            minibatch_gradient(
+                weights, samples, jnp.arange(16), agent, dataclasses.replace(config, microbatch=size)
+            )
             for size in (16, 4)
         ]
         # The loss over the whole minibatch, its advantages normalised.
@@ -183,11 +185,11 @@ def test_explained_variance():
 def test_without_a_whole_episode_the_return_is_nan():
     finished = {"done": jnp.array([[True]]), "episode_length": jnp.array([[3]])}
     finished |= {"episode_return": jnp.ones((1, 1)), "terminated": jnp.array([[False]])}
-    summary = learner.summarise(finished, {"reward": jnp.ones((1, 1))}, Params(max_steps_in_episode=4))
+    summary = rollout.summarise(finished, {"reward": jnp.ones((1, 1))}, Params(max_steps_in_episode=4))
     assert summary["episodes"] == 0
     assert np.isnan(summary["episode_return"])
     ended = finished | {"terminated": jnp.array([[True]])}
-    assert learner.summarise(ended, {}, Params(max_steps_in_episode=4))["episodes"] == 1
+    assert rollout.summarise(ended, {}, Params(max_steps_in_episode=4))["episodes"] == 1
 
 
 def test_only_whole_episodes_count_for_the_return_and_all_steps_for_the_rest():
@@ -199,6 +201,6 @@ def test_only_whole_episodes_count_for_the_return_and_all_steps_for_the_rest():
         "episode_return": jnp.array([[100.0, 200.0, 300.0], [2.0, 5.0, 400.0]]),
     }
     reward = jnp.array([[1.0, 2.0, 3.0], [4.0, 5.0, 9.0]])
-    summary = learner.summarise(finished, {"reward": reward}, Params(max_steps_in_episode=4))
+    summary = rollout.summarise(finished, {"reward": reward}, Params(max_steps_in_episode=4))
     assert (int(summary["episodes"]), float(summary["episode_return"])) == (2, 3.5)
     assert summary["reward"] == 4

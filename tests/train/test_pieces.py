@@ -59,11 +59,13 @@ def test_short_lists_change_neither_gradients_nor_outputs(draw_variables, encode
     @jax.jit
     def outcome(weights, inputs):
         order = shortest_first(jnp.arange(len(USED)), inputs, short)
-        samples = minibatch(inputs)
-        ordered = jax.tree.map(lambda leaf: leaf[order], samples)
+        samples, rows = minibatch(inputs), jnp.arange(len(USED))
         return (
-            (minibatch_gradient(weights, ordered, short, CONFIG), short.evaluate_quickly(weights, inputs)),
-            (minibatch_gradient(weights, samples, whole, CONFIG), whole.evaluate(weights, inputs)),
+            (
+                minibatch_gradient(weights, samples, order, short, CONFIG),
+                short.evaluate_quickly(weights, inputs),
+            ),
+            (minibatch_gradient(weights, samples, rows, whole, CONFIG), whole.evaluate(weights, inputs)),
         )
 
     got, expected = outcome(weights, inputs)
@@ -97,3 +99,4 @@ def test_the_size_of_a_piece_suits_the_encoder_and_divides_the_minibatch():
     assert dataclasses.replace(free, encoder="mhsa").piece_size == 32
     assert dataclasses.replace(free, encoder="mhsa", rollout_steps=10).piece_size == 16
     assert dataclasses.replace(free, microbatch=64).piece_size == 64
+    assert dataclasses.replace(free, encoder="beams", devices=16).piece_size == 64
