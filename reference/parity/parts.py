@@ -186,6 +186,6 @@ def part_row(
         agreement32=single.agreement if part.is_filter else None,
         agreement_stock=stock.agreement if part.uses_jacobian else None,
         ties=double.ties,
-        note=part.note,
+        note=double.note(part.note),
     )
     return row, [f"{part.stone_soup}, scenario {number}: {line}" for number, line in double.divergences]
