@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+from pathlib import Path
 from types import SimpleNamespace
 
 import jax
@@ -16,7 +17,7 @@ from reference.parity.episodes import Comparison, Divergence, EpisodeTallies, co
 from reference.parity.rows import Row, Tally
 from reference.parity.scenarios import KINDS, random_scenario
 from reference.parity.table import BEGIN, END, cells, write_readme
-from reference.parity.written import results
+from reference.parity.written import line_below, results, table_of
 
 pytestmark = pytest.mark.usefixtures("quick_compilation")
 
@@ -519,3 +520,13 @@ def test_a_row_is_not_put_beside_those_of_other_versions(written):
     out.write_text(json.dumps(found))
     with pytest.raises(ValueError, match=r"stonesoup = 1.9.1: .*parity.json was measured with 1.0"):
         command.main([*TINY, "--out", str(out)])
+
+
+def test_the_published_table_is_that_of_the_published_results(tmp_path):
+    root = Path(__file__).parents[2]
+    found = json.loads((root / "docs/parity.json").read_text())
+    page = tmp_path / "README.md"
+    page.write_text((root / "README.md").read_text())
+    write_readme(page, table_of(found), line_below(found))
+    assert page.read_text() == (root / "README.md").read_text()
+    assert all(row.passed for row in table_of(found))
