@@ -77,6 +77,15 @@ def arctan2(y: jax.Array, x: jax.Array) -> jax.Array:
     return jnp.copysign(angle, y).reshape(shape)
 
 
+def less_sine(angle: jax.Array) -> jax.Array:
+    """``angle - sin(angle)`` (rad), elementwise, to full precision also where nearly all of it cancels."""
+    square = angle**2
+    series = jnp.ones_like(angle)
+    for n in (12, 10, 8, 6, 4):  # below 0.5 rad no more terms are felt
+        series = 1 - square / (n * (n + 1)) * series
+    return jnp.where(jnp.abs(angle) < 0.5, angle * square / 6 * series, angle - jnp.sin(angle))
+
+
 def wrap_bearing(angle: jax.Array) -> jax.Array:
     """Angle (rad) in [-pi, pi), as Stone Soup's `Bearing`."""
     return angle - 2 * jnp.pi * jnp.floor((angle + jnp.pi) / (2 * jnp.pi))

@@ -1,5 +1,8 @@
 """Motion and measurement models against hand values and against each other's inverse."""
 
+import math
+from fractions import Fraction
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -169,3 +172,20 @@ def test_arctan2_on_the_axes(x, y):
     found = models.arctan2(jnp.asarray([y], jnp.float32), jnp.asarray([x], jnp.float32))
     np.testing.assert_allclose(found, np.arctan2(np.float32([y]), np.float32([x])), rtol=2e-7)
     assert np.signbit(found[0]) == np.signbit(np.arctan2(y, x))
+
+
+def exact_less_sine(angle):
+    """``angle - sin(angle)`` by its series in fractions."""
+    x = Fraction(float(angle))
+    return float(sum((-1) ** (n + 1) * x ** (2 * n + 1) / math.factorial(2 * n + 1) for n in range(1, 20)))
+
+
+@pytest.mark.parametrize(("dtype", "within"), [(np.float64, 2e-14), (np.float32, 1e-5)])
+def test_an_angle_less_its_sine_keeps_its_digits(x64, dtype, within):
+    """In both branches, and on both sides of where they meet."""
+    sizes = np.concatenate([np.geomspace(1e-8, 3.1, 60), [0.5, np.nextafter(0.5, 0)]])
+    angle = np.concatenate([sizes, -sizes]).astype(dtype)
+    found = jax.jit(models.less_sine)(jnp.asarray(angle))
+    assert found.dtype == dtype
+    np.testing.assert_allclose(found, [exact_less_sine(x) for x in angle], rtol=within)
+    assert models.less_sine(jnp.zeros(1))[0] == 0

@@ -14,18 +14,18 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from jaxtrack import cores
 from jaxtrack.cli import parse, require_file, require_integer, run, wide_console
-from jaxtrack.report import circumstances
 from reference.parity.environment import environment_rows
 from reference.parity.free_running import free_running_rows
 from reference.parity.metrics import COMPARISONS, metric_rows
 from reference.parity.models import NUM_MODELS, model_rows
 from reference.parity.oracle import Job, run_all
-from reference.parity.parts import part_rows
+from reference.parity.parts import PARTS, divergences_of, part_rows
 from reference.parity.records import random_records
 from reference.parity.rows import Row
 from reference.parity.scenarios import random_scenario
 from reference.parity.stepwise import component_rows
 from reference.parity.table import print_rows, write_readme
+from reference.parity.written import line_below, read_results, results, table_of, with_row
 
 Item = TypeVar("Item")
 
@@ -57,6 +57,9 @@ class ParityOptions:
     """Number of the first random scenario."""
     processes: int = 0
     """Processes for Stone Soup; 0 takes one per core."""
+    only: str | None = None
+    """Component of one of the parts beside the default ones, as in the table: only its row is measured, and
+    replaces the one in `out`, which the same options and versions must have made."""
     out: Path = Path("parity.json")
     """Results in full."""
     readme: Path | None = None
@@ -81,12 +84,20 @@ def check(options: ParityOptions) -> None:
     for name in ("seed", "processes"):
         require_integer(name, getattr(options, name), 0)
     require_file("out", options.out)
+    components = [part.component for part in PARTS]
+    if options.only is not None and options.only not in components:
+        raise ValueError(f"only = {options.only!r}: expected one of {'; '.join(components)}")
     if options.readme is not None and not options.readme.is_file():
         raise ValueError(f"readme = {str(options.readme)!r}: no such file")
 
 
+def asked(options: ParityOptions) -> dict[str, Any]:
+    """The options that results depend on, and the number of processes."""
+    return {name: value for name, value in vars(options).items() if name not in ("only", "out", "readme")}
+
+
 def measure(options: ParityOptions, progress: Progress) -> tuple[list[Row], list[str]]:
-    """All rows of the table, and every first divergence in one line."""
+    """All rows of the table, or the one asked for, and every first divergence in one line."""
     processes = options.processes or cores.available()
 
     def follow(items: Iterable[Item], total: int, what: str) -> Iterator[Item]:
@@ -94,6 +105,12 @@ def measure(options: ParityOptions, progress: Progress) -> tuple[list[Row], list
             print(f"{what}: {total}", file=sys.stderr, flush=True)
         yield from progress.track(items, total=total, description=what)
 
+    def measure_parts() -> tuple[list[Row], list[str]]:
+        parts = [part for part in PARTS if options.only in (None, part.component)]
+        return part_rows(parts, options.seed, options.part_episodes, options.steps, processes, follow)
+
+    if options.only is not None:
+        return measure_parts()
     first, last = options.seed, options.seed + options.scenarios
     scenarios = [random_scenario(seed, options.steps) for seed in range(first, last)]
     jobs = [Job(scenario, intermediates=True) for scenario in scenarios]
@@ -104,7 +121,7 @@ def measure(options: ParityOptions, progress: Progress) -> tuple[list[Row], list
     episodes, divergences = free_running_rows(seeds, options.steps, processes, follow)
     rows += episodes
 
-    parts, lines = part_rows(options.seed, options.part_episodes, options.steps, processes, follow)
+    parts, lines = measure_parts()
     rows += parts
     divergences += lines
 
@@ -124,6 +141,7 @@ def main(argv: Sequence[str]) -> int:
     if options.quick:
         options = dataclasses.replace(options, **QUICK)
     check(options)
+    written = None if options.only is None else read_results(options.out, asked(options), options.only)
     jax.config.update("jax_enable_x64", True)
     started = time.perf_counter()
     columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
@@ -134,34 +152,18 @@ def main(argv: Sequence[str]) -> int:
     print_rows(rows, wide_console())
     for line in divergences:
         print(line)
-    failed = [row for row in rows if not row.passed]
+    found = results(asked(options), rows, divergences, seconds)
+    if written is not None and options.only is not None:
+        found = with_row(written, found, options.only, divergences_of(options.only))
+    table = table_of(found)
+    failed = [row for row in table if not row.passed]
     for row in failed:
         print(f"FAILED: {row.component} against {row.stone_soup}: {row.float64}, {row.agreement}")
-    options.out.write_text(json.dumps(result(options, rows, divergences, seconds), indent=1) + "\n")
+    options.out.write_text(json.dumps(found, indent=1) + "\n")
     if options.readme is not None:
-        write_readme(options.readme, rows, options_line(options, seconds))
-    print(f"{options.out}: {len(rows)} rows, {len(failed)} failed, {seconds:.0f} s")
+        write_readme(options.readme, table, line_below(found))
+    print(f"{options.out}: {len(table)} rows, {len(failed)} failed, {seconds:.0f} s")
     return 1 if failed else 0
-
-
-def result(options: ParityOptions, rows: list[Row], divergences: list[str], seconds: float) -> dict:
-    """What is written."""
-    asked = {name: value for name, value in vars(options).items() if name not in ("out", "readme")}
-    return {
-        **circumstances(),
-        "options": asked,
-        "seconds": round(seconds, 1),
-        "rows": [dataclasses.asdict(row) | {"passed": row.passed} for row in rows],
-        "divergences": divergences,
-    }
-
-
-def options_line(options: ParityOptions, seconds: float) -> str:
-    """What was run, for beneath the table."""
-    found = circumstances()
-    versions = ", ".join(f"{name} {found['versions'][name]}" for name in ("python", "jax", "stonesoup"))
-    size = f"{options.scenarios * options.steps:,} steps one by one, {options.episodes:,} whole episodes"
-    return f"{size}; {versions}; {found['machine']['cores']} cores, {seconds / 60:.0f} min."
 
 
 if __name__ == "__main__":

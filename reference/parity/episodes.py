@@ -5,9 +5,10 @@ import dataclasses
 import jax
 import numpy as np
 
-from jaxtrack.params import Params
-from jaxtrack.tracker import TrackerInfo
+from jaxtrack.params import Params, StaticParams
+from jaxtrack.tracker import DEFAULT, TrackerInfo
 from jaxtrack.types import NO_DETECTION, Tracks
+from reference.components import step_duration, transition_model
 from reference.parity.rows import Tally
 from reference.pipeline import Estimate, StepRecord
 from reference.translate import TrackKey, slot_keys
@@ -42,7 +43,7 @@ class Divergence:
 
 @dataclasses.dataclass
 class Comparison:
-    """What came out of one episode, up to its first divergence or exact tie.
+    """What came out of one episode, up to its first divergence, exact tie or covariance without a factor.
 
     Attributes:
         steps: steps that agree.
@@ -53,6 +54,7 @@ class Comparison:
         births: births that agree.
         deletions: deletions that agree.
         tie: whether an exact tie ended the comparison.
+        indefinite: whether a covariance ended it from which no sigma points can be made.
         divergence: the first difference, None if there is none.
     """
 
@@ -64,6 +66,7 @@ class Comparison:
     births: int = 0
     deletions: int = 0
     tie: bool = False
+    indefinite: bool = False
     divergence: Divergence | None = None
 
     @property
@@ -86,7 +89,7 @@ class EpisodeTallies:
     """What is collected over many episodes against one kind of initiator."""
 
     def __init__(self) -> None:
-        self.steps, self.births, self.decisions, self.ties = 0, 0, 0, 0
+        self.steps, self.births, self.decisions, self.ties, self.indefinite = 0, 0, 0, 0, 0
         self.state, self.birth = Tally(), Tally()
         self.divergences: list[tuple[int, Divergence]] = []
 
@@ -96,6 +99,7 @@ class EpisodeTallies:
         self.births += comparison.births
         self.decisions += comparison.decisions
         self.ties += comparison.tie
+        self.indefinite += comparison.indefinite
         self.state.error(comparison.error)
         self.birth.error(comparison.birth_error)
         if comparison.divergence is not None:
@@ -107,6 +111,14 @@ class EpisodeTallies:
         wrong = len(self.divergences)
         return self.decisions / (self.decisions + wrong) if self.decisions + wrong else float("nan")
 
+    def note(self, *others: str) -> str:
+        """What a reader must know of a row: the others, and how many episodes ended for want of a factor."""
+        ended = (
+            "episodes that end early, with a covariance that is indefinite on both sides (Stone Soup goes on "
+            f"with a wrong factor, ours is NaN): {self.indefinite}"
+        )
+        return "; ".join(filter(None, [*others, ended if self.indefinite else ""]))
+
 
 def compare_episode(
     records: list[StepRecord],
@@ -115,8 +127,12 @@ def compare_episode(
     active: np.ndarray,
     params: Params,
     tolerance: float,
+    static: StaticParams = DEFAULT,
 ) -> Comparison:
-    """Compares an episode of ours with Stone Soup's until the first divergence or exact tie.
+    """Compares an episode of ours with Stone Soup's until the first divergence, or until it has no right end.
+
+    Which is at an exact tie, and where sigma points are asked for of a covariance without a Cholesky
+    factor. The step that left that covariance is compared, and so is the covariance.
 
     Args:
         records: Stone Soup's steps.
@@ -125,13 +141,39 @@ def compare_episode(
         active: `[K, D]` which rows of the scans hold a detection.
         params: numbers of the tracker.
         tolerance: largest error, in standard deviations, that is no divergence.
+        static: the components, by name.
     """
-    for k in range(len(records)):
+    without_factor = first_without_factor(records, params) if needs_factors(static) else len(records)
+    for k in range(without_factor):
         if is_tied(jax.tree.map(lambda leaf, k=k: leaf[k], info), active[k], params):
             result = compare_records(to_records(tracks, info, k), records[:k], tolerance)
             result.tie = result.divergence is None
             return result
-    return compare_records(to_records(tracks, info, len(records)), records, tolerance)
+    shared = records[:without_factor]
+    result = compare_records(to_records(tracks, info, without_factor), shared, tolerance)
+    result.indefinite = len(shared) < len(records) and result.divergence is None
+    return result
+
+
+def needs_factors(static: StaticParams) -> bool:
+    """Whether the filter makes sigma points of full covariances."""
+    return static.filter in ("unscented", "cubature") and static.covariance_form == "full"
+
+
+def first_without_factor(records: list[StepRecord], params: Params) -> int:
+    """How many steps Stone Soup does before it predicts an indefinite covariance; all of them if it does not.
+
+    Stone Soup's own covariances decide: what is wrong with ours alone is no excuse.
+    """
+    model, duration = transition_model(params.process_noise), step_duration(params)
+    F, Q = model.matrix(time_interval=duration), model.covar(time_interval=duration)
+    for k, record in enumerate(records[:-1], start=1):
+        try:
+            for estimate in record.live.values():
+                np.linalg.cholesky(np.asarray(F @ estimate.covariance @ F.T + Q, float))
+        except np.linalg.LinAlgError:
+            return k
+    return len(records)
 
 
 def is_tied(info: TrackerInfo, active: np.ndarray, params: Params) -> bool:

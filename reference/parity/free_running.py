@@ -61,7 +61,8 @@ def compare(
 ) -> Comparison:
     """Our episode, in one precision, beside Stone Soup's."""
     active = np.asarray(scenario.detections.active)
-    return compare_episode(records, *episode(scenario, is_double, static), active, scenario.params, tolerance)
+    tracks, info = episode(scenario, is_double, static)
+    return compare_episode(records, tracks, info, active, scenario.params, tolerance, static)
 
 
 def _rows(episodes: int, double: EpisodeTallies, single: EpisodeTallies, stock: EpisodeTallies) -> list[Row]:
@@ -87,7 +88,9 @@ def _rows(episodes: int, double: EpisodeTallies, single: EpisodeTallies, stock: 
             agreement32=single.agreement,
             agreement_stock=stock.agreement,
             ties=double.ties,
-            note=f"exact ties that ended an episode: {double.ties}; decisions of float32 and of the stock "
-            "initiator are counted up to their first difference",
+            note=double.note(
+                f"exact ties that ended an episode: {double.ties}",
+                "decisions of float32 and of the stock initiator are counted up to their first difference",
+            ),
         ),
     ]

@@ -1,6 +1,7 @@
 """The parts that a tracker can be made of beside the default ones: whole episodes with each of them."""
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -137,11 +138,12 @@ def away_from_the_seam(scenario: Scenario) -> Scenario:
 
 
 def part_rows(
-    first: int, episodes: int, steps: int, processes: int, follow: Follow
+    parts: Sequence[Part], first: int, episodes: int, steps: int, processes: int, follow: Follow
 ) -> tuple[list[Row], list[str]]:
     """One row per part, and every first divergence in one line.
 
     Args:
+        parts: which.
         first: number of the first scenario of each part.
         episodes: scenarios of each part.
         steps: of each scenario.
@@ -149,7 +151,7 @@ def part_rows(
         follow: shows progress over an iterable of the given length under the given name.
     """
     rows, divergences = [], list[str]()
-    for part in PARTS:
+    for part in parts:
         numbers = range(first, first + episodes)
         scenarios = [scenario_for(part, number, steps) for number in numbers]
         row, lines = part_row(part, numbers, scenarios, processes, follow)
@@ -186,6 +188,13 @@ def part_row(
         agreement32=single.agreement if part.is_filter else None,
         agreement_stock=stock.agreement if part.uses_jacobian else None,
         ties=double.ties,
-        note=part.note,
+        note=double.note(part.note),
     )
-    return row, [f"{part.stone_soup}, scenario {number}: {line}" for number, line in double.divergences]
+    named = divergences_of(part.component)
+    return row, [f"{named}{number}: {line}" for number, line in double.divergences]
+
+
+def divergences_of(component: str) -> str:
+    """How the lines of a part's divergences begin."""
+    (part,) = [part for part in PARTS if part.component == component]
+    return f"{part.stone_soup}, scenario "

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+from pathlib import Path
 from types import SimpleNamespace
 
 import jax
@@ -16,6 +17,7 @@ from reference.parity.episodes import Comparison, Divergence, EpisodeTallies, co
 from reference.parity.rows import Row, Tally
 from reference.parity.scenarios import KINDS, random_scenario
 from reference.parity.table import BEGIN, END, cells, write_readme
+from reference.parity.written import line_below, results, table_of
 
 pytestmark = pytest.mark.usefixtures("quick_compilation")
 
@@ -417,3 +419,114 @@ def test_a_readme_without_marks_is_refused(tmp_path):
     with pytest.raises(ValueError, match="expected the marks"):
         write_readme(path, [GOOD], "below")
     assert path.read_text() == "nothing"
+
+
+ONLY = "lifecycle.is_missed_long"
+TINY = ["--only", ONLY, "--part-episodes", "1", "--steps", "12", "--processes", "1"]
+LINES = [
+    "UpdateTimeDeleter, scenario 3: of before",
+    "UpdateTimeStepsDeleter, scenario 3: step 1",
+    "environment: step 2",
+]
+
+
+@pytest.fixture
+def written(tmp_path):
+    """Results of a whole run with the sizes of `TINY`, in which the row to be replaced fails, and a page."""
+    asked = command.asked(command.ParityOptions(part_episodes=1, steps=12))
+    stale = dataclasses.replace(GOOD, component=ONLY, agreement=0.5)
+    rows = [dataclasses.replace(GOOD, note="first"), stale, dataclasses.replace(GOOD, component="last")]
+    out, readme = tmp_path / "parity.json", tmp_path / "README.md"
+    out.write_text(json.dumps(results(asked, rows, LINES, 60.0)))
+    readme.write_text(f"{BEGIN}\nstale table\n{END}")
+    return out, readme
+
+
+def test_one_row_measured_again_replaces_its_own(written, capsys):
+    out, readme = written
+    before = json.loads(out.read_text())
+    options = [*TINY, "--out", str(out), "--readme", str(readme)]
+    assert command.main(options) == 0, capsys.readouterr().out
+    found = json.loads(out.read_text())
+    (again,) = found.pop("again")
+    assert again["component"] == ONLY
+    assert again["seconds"] < 60
+    row = found["rows"][1]
+    assert (row["stone_soup"], row["compared"], row["passed"]) == (
+        "UpdateTimeDeleter, 1 whole episodes",
+        12,
+        True,
+    )
+    # All else is as it was.
+    before["rows"][1] = row
+    before["divergences"] = LINES[1:]
+    assert found == before
+    table = readme.read_text()
+    assert [line.split("|")[1].strip() for line in table.splitlines() if line.startswith("| `")] == [
+        "`a`",
+        f"`{ONLY}`",
+        "`last`",
+    ]
+    assert "* `a` (b): first." in table
+    assert "2,640 steps one by one, 1,000 whole episodes; python" in table
+    assert f"1 min; `{ONLY}` again {again['date'][:10]}." in table
+    # A second time, in place of the first.
+    assert command.main(options) == 0
+    assert len(json.loads(out.read_text())["again"]) == 1
+
+
+def test_divergences_of_a_row_measured_again_come_before_those_of_the_environment(written, monkeypatch):
+    out, _ = written
+    failed = dataclasses.replace(GOOD, component=ONLY, agreement=0.9)
+    new = "UpdateTimeDeleter, scenario 0: of now"
+    monkeypatch.setattr(command, "part_rows", lambda parts, *_: ([failed], [new]))
+    assert command.main([*TINY, "--out", str(out)]) == 1
+    found = json.loads(out.read_text())
+    assert found["divergences"] == [LINES[1], new, LINES[2]]
+    assert not found["rows"][1]["passed"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["--only", "tracker.step"], "only = 'tracker.step': expected one of kalman.predict_detections_ext"),
+        ([*TINY, "--steps", "13"], "steps = 13: .*parity.json was measured with 12"),
+        (["--only", "lifecycle.take_over", *TINY[2:]], "it has no row of lifecycle.take_over"),
+        ([*TINY, "--out", "nothing.json"], "out = 'nothing.json': expected the results of a whole run"),
+    ],
+    ids=["no such part", "other options", "no such row", "no results"],
+)
+def test_a_row_is_put_only_where_it_belongs(written, arguments, said, monkeypatch):
+    out, _ = written
+    monkeypatch.chdir(out.parent)
+    before = out.read_text()
+    with pytest.raises(ValueError, match=said):
+        command.main(["--out", str(out), *arguments])
+    assert out.read_text() == before
+
+
+@pytest.mark.parametrize("text", ["{}", "[]", "no JSON", '{"rows": [1], "options": {}, "versions": {}}'])
+def test_a_row_needs_results_of_a_whole_run(written, text):
+    out, _ = written
+    out.write_text(text)
+    with pytest.raises(ValueError, match="expected the results of a whole run"):
+        command.main([*TINY, "--out", str(out)])
+
+
+def test_a_row_is_not_put_beside_those_of_other_versions(written):
+    out, _ = written
+    found = json.loads(out.read_text())
+    found["versions"]["stonesoup"] = "1.0"
+    out.write_text(json.dumps(found))
+    with pytest.raises(ValueError, match=r"stonesoup = 1.9.1: .*parity.json was measured with 1.0"):
+        command.main([*TINY, "--out", str(out)])
+
+
+def test_the_published_table_is_that_of_the_published_results(tmp_path):
+    root = Path(__file__).parents[2]
+    found = json.loads((root / "docs/parity.json").read_text())
+    page = tmp_path / "README.md"
+    page.write_text((root / "README.md").read_text())
+    write_readme(page, table_of(found), line_below(found))
+    assert page.read_text() == (root / "README.md").read_text()
+    assert all(row.passed for row in table_of(found))

@@ -3,7 +3,9 @@
 Whole episodes with each of them: `reference.parity.parts`, which `test_command` runs.
 """
 
+import dataclasses
 import datetime
+import warnings
 from types import SimpleNamespace
 
 import jax
@@ -34,6 +36,10 @@ from reference.parity.compare import (
     mean_error,
 )
 from reference.parity.environment import LIVELY, EnvironmentTallies, compare_environment
+from reference.parity.episodes import EpisodeTallies, compare_episode
+from reference.parity.free_running import compare
+from reference.parity.oracle import Job, run
+from reference.parity.ours import episode
 from reference.parity.parts import PARTS, scenario_for
 from reference.parity.scenes import AHEAD, BEHIND, UP, random_covariances, random_means, track_list
 from reference.pipeline import estimate
@@ -254,6 +260,76 @@ def test_scenarios_have_what_their_parts_need():
         assert ("update_time" in part.static.deleters) == (scenario.params.deletion_time is not None)
         assert ("update_time_steps" in part.static.deleters) == (scenario.params.deletion_steps is not None)
         assert scenario.kind in part.kinds
+
+
+CUBATURE = next(part for part in PARTS if part.component == "kalman.predict_detections_cubature")
+
+
+def test_a_long_cubature_episode_keeps_its_digits():
+    """A crowd at 11 km seen every 16 ms, whose tracks are updated dozens of times."""
+    scenario = scenario_for(CUBATURE, 43, 50)
+    records = run(Job(scenario, static=CUBATURE.static))
+    found = compare(scenario, records, True, TOLERANCE, CUBATURE.static)
+    assert (found.steps, found.divergence, found.indefinite) == (50, None, False)
+    assert found.error < 1e-10
+
+
+LOST, LOST_ON = (37, 0), 39
+"""A new track at 1.1 km, 72 degrees high, whose first update leaves it an indefinite covariance."""
+
+
+@pytest.fixture(scope="module")
+def indefinite():
+    """The scenario and both sides' episode."""
+    scenario = scenario_for(CUBATURE, 12, 50)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of Stone Soup, as it goes on from there
+        records = run(Job(scenario, static=CUBATURE.static))
+    return scenario, records, *episode(scenario, static=CUBATURE.static)
+
+
+def compare_indefinite(scenario, records, tracks, info, static=CUBATURE.static):
+    active = scenario.detections.active
+    return compare_episode(records, tracks, info, active, scenario.params, TOLERANCE, static)
+
+
+def with_live(records, step, **fields):
+    """The records with another estimate of the track at the end of a step."""
+    record = records[step - 1]
+    live = {**record.live, LOST: dataclasses.replace(record.live[LOST], **fields)}
+    return [*records[: step - 1], dataclasses.replace(record, live=live), *records[step:]]
+
+
+def test_an_episode_ends_where_both_sides_have_the_same_indefinite_covariance(indefinite):
+    _, records, tracks, info = indefinite
+    found = compare_indefinite(*indefinite)
+    assert (found.steps, found.divergence, found.indefinite, found.tie) == (LOST_ON, None, True, False)
+    assert np.linalg.eigvalsh(records[LOST_ON - 1].live[LOST].covariance).min() < 0
+    # From there on ours has no numbers.
+    slot = list(zip(tracks.birth_step[LOST_ON], tracks.birth_detection[LOST_ON], strict=True)).index(LOST)
+    assert np.isnan(info.distances[LOST_ON, slot]).all()
+    tallies = EpisodeTallies()
+    assert tallies.note("what else", "") == "what else"
+    tallies.add(12, found)
+    assert tallies.note("what else").startswith("what else; episodes that end early, with a covariance")
+    assert tallies.note().endswith(": 1")
+
+
+def test_an_indefinite_covariance_excuses_nothing_else(indefinite):
+    scenario, records, tracks, info = indefinite
+    # Where no factors are needed.
+    found = compare_indefinite(*indefinite, static=StaticParams(filter="extended"))
+    assert not found.indefinite
+    assert found.divergence.step > LOST_ON
+    # Before it.
+    estimate = records[LOST_ON - 1].live[LOST]
+    wrong = with_live(records, LOST_ON, mean=estimate.mean + 0.1)
+    found = compare_indefinite(scenario, wrong, tracks, info)
+    assert (found.divergence.step, found.divergence.track, found.indefinite) == (LOST_ON, LOST, False)
+    # Ours alone.
+    sound = with_live(records, LOST_ON, covariance=np.diag(np.diag(estimate.covariance)))
+    found = compare_indefinite(scenario, sound, tracks, info)
+    assert (found.divergence.step, found.divergence.track, found.indefinite) == (LOST_ON, LOST, False)
 
 
 def test_both_environments_with_other_parts():
