@@ -23,6 +23,8 @@ from jaxtrack.scan_map import look_grid
 from reference.components import time_of
 from reference.managers import build_manager, look_of
 from reference.translate import to_stone_soup_tracks
+from train.agents import agent_policy
+from train.saved_run import load_run
 
 DIFFERENT = 1
 TOLERANCE = 1e-3
@@ -40,6 +42,8 @@ class PlanningOptions:
     """Looks that the rollout planner tries."""
     horizons: tuple[int, ...] = (10, 20)
     """Steps that it looks ahead."""
+    runs: tuple[Path, ...] = ()
+    """Trained agents to time beside them: folders of runs or of exported agents, as agents/beams."""
     repeats: int = 5
     """Times that everything is timed."""
     stone_soup_decisions: int = 2
@@ -81,7 +85,19 @@ def managers(options: PlanningOptions) -> dict[str, policies.PolicyBuilder]:
         for candidates in options.candidates
         for horizon in options.horizons
     }
-    return {"index": policies.index, SAME_RULE: uncertainty, "greedy": greedy, **planners}
+    agents = {f"agent, {folder.name}": agent(folder) for folder in options.runs}
+    return {"index": policies.index, SAME_RULE: uncertainty, "greedy": greedy, **planners, **agents}
+
+
+def agent(folder: Path) -> policies.PolicyBuilder:
+    """A trained agent, which observes what it was trained on.
+
+    Raises:
+        ValueError: naming the folder, if it holds none.
+    """
+    config, env, weights = load_run(folder)
+    build = agent_policy(config.encoder, weights, head=config.head)
+    return lambda static, params: build(env.static, config.params)
 
 
 def scenes(static: StaticParams, params: Params, count: int, seed: int) -> EnvState:

@@ -1,6 +1,8 @@
 """The benchmark of the managers: the same track lists for all, complete in its file."""
 
+import dataclasses
 import json
+from pathlib import Path
 
 import jax
 import numpy as np
@@ -9,7 +11,7 @@ from rich.progress import Progress
 
 from benchmarks import planning
 from benchmarks.planning import PlanningOptions
-from jaxtrack import Params, StaticParams, report
+from jaxtrack import Params, StaticParams, make, report
 from jaxtrack.managers import expected_falls
 from jaxtrack.scan_map import look_grid
 
@@ -39,6 +41,17 @@ def test_one_row_for_each_manager_and_number_of_states(found):
     cases = [(row["manager"], row["num_states"]) for row in found["rows"]]
     names = ["index", "uncertainty", "greedy", "rollout, 3 looks, 2 steps"]
     assert cases == [(planning.STONE_SOUP, 1), *((name, 3) for name in names)]
+
+
+def test_agents_decide_on_what_they_were_trained_to_observe():
+    options = dataclasses.replace(OPTIONS, runs=(Path("agents/beams"),))
+    build = planning.managers(options)["agent, beams"]
+    env, params = make()
+    state = jax.eval_shape(env.reset_env, jax.random.key(0), params)[1]
+    look = jax.eval_shape(lambda key, state: build(env.static, params)(key, state), jax.random.key(0), state)
+    assert look.shape == (2,)
+    with pytest.raises(ValueError, match="nowhere"):
+        planning.managers(dataclasses.replace(OPTIONS, runs=(Path("nowhere"),)))
 
 
 def test_speeds_and_ratio(found):

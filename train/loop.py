@@ -64,7 +64,7 @@ def compile_training(run: Run, env: SearchTrack, console: Console) -> Programs:
         if run.state is None:
             init = init.lower(jax.random.key(config.seed), config.params).compile()
         step = jitted.step.lower(shapes).compile()
-    console.print(f"compiled in {time.perf_counter() - started:.1f} s, for {config.devices} devices")
+    console.print(f"compiled in {time.perf_counter() - started:.1f} s; devices: {config.devices}")
     return Programs(init, step, jitted.places)
 
 
