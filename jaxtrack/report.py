@@ -42,7 +42,7 @@ def with_spread(values: dict[str, Any]) -> str:
 def write_report(file: Path, report: dict[str, Any], options: Any, **found: Any) -> None:
     """Writes a JSON file: the circumstances, the options that are not about output, and what was found."""
     asked = {name: value for name, value in vars(options).items() if name not in OUTPUT_OPTIONS}
-    file.write_text(json.dumps({**report, "options": asked, **found}, indent=2) + "\n")
+    file.write_text(json.dumps({**report, "options": asked, **found}, indent=2, default=str) + "\n")
 
 
 def circumstances(packages: Sequence[str] = PACKAGES) -> dict[str, Any]:
