@@ -219,6 +219,19 @@ def test_an_update_ends_where_the_policy_has_gone_too_far_but_for_imitation(trac
     assert any(jax.tree.leaves(changed))
 
 
+def test_an_update_that_has_ended_stays_so(traced, monkeypatch):
+    """Only the minibatch with sample 0, one of two in every epoch, says that the policy has gone too far."""
+
+    def gradient(weights, samples, rows, *rest):
+        return jax.tree.map(jnp.zeros_like, weights), {"approximate_kl": 1.0 * jnp.any(rows == 0)}
+
+    monkeypatch.setattr(learner, "minibatch_gradient", gradient)
+    probe = Probe(right_look, 4)
+    config = config_for(probe, target_kl=0.1)
+    _, metrics = jax.jit(lambda state: learner.train_step(state, probe, config))(start(probe, config))
+    assert metrics["steps_taken"] * 8 in (0, 1)
+
+
 def test_the_step_is_traced_once_and_other_numbers_retrace_nothing(traced):
     probe = Probe(right_look, 4)
     config = config_for(probe)
