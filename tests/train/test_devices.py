@@ -49,7 +49,8 @@ exact(shared.env.time, alone.env.time)
 """
 
 
-@pytest.mark.parametrize("encoder", ["beams", pytest.param("bigru", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("encoder", ["beams", "bigru"])
 def test_two_devices_learn_what_one_learns(quick_code, encoder):
     flags = [f"--{name}={str(value).lower()}" for name, value in quick_code.items()]
     quickly = {"JAX_DISABLE_MOST_OPTIMIZATIONS": "1", "XLA_FLAGS": " ".join(flags)}
