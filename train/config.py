@@ -138,10 +138,14 @@ class TrainConfig:
         divisors = (size for size in range(1, self.num_envs + 1) if self.num_envs % size == 0)
         return next(size for size in divisors if size * self.rollout_steps % self.num_minibatches == 0)
 
+    @property
+    def shared(self) -> tuple[int, int]:
+        """Groups of environments, and smallest pieces of a minibatch, that devices can share."""
+        return self.num_envs // self.group_size, self.minibatch_size // (self.microbatch or 1)
+
     def shares_equally(self, devices: int) -> bool:
-        """Whether so many devices can share groups of environments, and pieces of minibatches."""
-        groups, pieces = self.num_envs // self.group_size, self.minibatch_size // (self.microbatch or 1)
-        return groups % devices == 0 and pieces % devices == 0
+        """Whether so many devices can have as many groups and pieces each."""
+        return all(number % devices == 0 for number in self.shared)
 
     @property
     def warm_start_updates(self) -> int:
@@ -221,7 +225,7 @@ def _check_batches(config: TrainConfig) -> None:
         config.minibatch_size % config.piece_size == 0,
         f"a divisor of the minibatch of {config.minibatch_size} samples",
     )
-    groups, pieces = config.num_envs // config.group_size, config.minibatch_size // (config.microbatch or 1)
+    groups, pieces = config.shared
     shares = config.shares_equally(max(1, config.devices))
     divided = f"{groups} groups of environments and {pieces} pieces of a minibatch"
     _require(config, "devices", shares, f"0, or a divisor of {divided}")

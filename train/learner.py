@@ -19,7 +19,7 @@ from train.learner_state import LearnerState
 from train.loss import Sample, explained_variance
 from train.pieces import minibatch_gradient, shortest_first
 from train.pretrain import pretrain
-from train.rollout import Transition, collect
+from train.rollout import Transition, collect, imitates
 from train.varied import randomised, scenario_at
 
 
@@ -122,8 +122,7 @@ def update_epochs(
     flat = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), samples)
     optimiser = make_optimiser(config)
 
-    imitates = state.update < config.warm_start_updates
-    farthest = jnp.where(imitates, jnp.inf, 1.5 * config.target_kl or jnp.inf)
+    farthest = jnp.where(imitates(state, config), jnp.inf, 1.5 * config.target_kl or jnp.inf)
 
     def one_minibatch(carry: tuple[Any, Any, jax.Array], rows: jax.Array) -> tuple[Any, Any]:
         weights, optimiser_state, near = carry

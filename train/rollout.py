@@ -46,7 +46,7 @@ def collect(
 ) -> tuple[LearnerState, Transition, dict[str, jax.Array]]:
     """Runs every environment for `rollout_steps` steps with the current weights."""
     choose = build_chooser(state, env, agent, config)
-    taught = jnp.full(state.episode_length.shape, state.update < config.warm_start_updates)
+    taught = jnp.full(state.episode_length.shape, imitates(state, config))
 
     def one_step(carry: LearnerState, key: jax.Array) -> tuple[LearnerState, tuple[Transition, Any, Any]]:
         key_action, key_env = share.own(jax.random.split(key, (2, config.num_envs)), axis=1)
@@ -99,8 +99,12 @@ def build_chooser(state: LearnerState, env: SearchTrack, agent: Agent, config: T
         del logits
         return jax.vmap(rule)(key, states)
 
-    imitates = state.update < config.warm_start_updates
-    return lambda *now: jax.lax.cond(imitates, by_rule, by_policy, *now)
+    return lambda *now: jax.lax.cond(imitates(state, config), by_rule, by_policy, *now)
+
+
+def imitates(state: LearnerState, config: TrainConfig) -> jax.Array:
+    """Whether `[]` the policy still imitates its rule in this update."""
+    return state.update < config.warm_start_updates
 
 
 def value_at_end(weights: Any, final_observation: Any, done: jax.Array, agent: Agent) -> jax.Array:
