@@ -3,8 +3,9 @@
 from importlib import import_module
 from typing import Any
 
-from jaxtrack.params import Params, StaticParams, validate
+from jaxtrack.params import Params, StaticParams
 from jaxtrack.types import NO_DETECTION, Detections, Tracks, Truths
+from jaxtrack.validation import validate
 
 __version__ = "0.1.0"
 

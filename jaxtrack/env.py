@@ -14,12 +14,13 @@ from jaxtrack.episode import EnvState, StepNoise, StepRecord, sample_step_noise
 from jaxtrack.kernel import Function, one_by_one, rarely
 from jaxtrack.lifecycle import no_tracks
 from jaxtrack.observation import TRACK_FEATURES, Observation, observe
-from jaxtrack.params import Params, StaticParams, check_trajectories, validate
+from jaxtrack.params import Params, StaticParams
 from jaxtrack.reward import reward_terms
 from jaxtrack.sampling import split
 from jaxtrack.scan_map import initial_scan_map, mean_scan_value, update_scan_map
 from jaxtrack.sensor import detect, look_angles
 from jaxtrack.truth import initiate_truths, propagate_truths
+from jaxtrack.validation import check_trajectories, validate
 
 ENV_ID = "SearchTrack-v0"
 

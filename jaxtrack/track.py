@@ -36,14 +36,12 @@ from jaxtrack.params import (
     MEASURES,
     Params,
     StaticParams,
-    allowed_range,
-    validate,
-    with_unit,
 )
 from jaxtrack.track_file import TrackWriter, partial_path
 from jaxtrack.track_plot import SUFFIXES, TrackPaths
 from jaxtrack.tracker import DEFAULT
 from jaxtrack.tracking import track_scans
+from jaxtrack.validation import allowed_range, validate, with_unit
 
 TRACKER_FIELDS = (
     "elevation_sigma",

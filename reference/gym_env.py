@@ -10,7 +10,8 @@ import numpy as np
 from gymnasium import spaces
 
 from jaxtrack.observation import TRACK_FEATURES
-from jaxtrack.params import Params, StaticParams, validate
+from jaxtrack.params import Params, StaticParams
+from jaxtrack.validation import validate
 from reference.simulation import Observation, StoneSoupScenario
 
 ENV_ID = "StoneSoupSearchTrack-v0"

@@ -20,10 +20,11 @@ import tyro
 
 from jaxtrack.cli import parse, run, wide_console
 from jaxtrack.geodesy import to_east_north
-from jaxtrack.params import Params, StaticParams, validate
+from jaxtrack.params import Params, StaticParams
 from jaxtrack.track import TRACKER_FIELDS
 from jaxtrack.trajectories import AIRCRAFT, MAX_AGE, Recording, read_opensky
 from jaxtrack.types import Detections
+from jaxtrack.validation import validate
 from reference.parity.episodes import Comparison, compare_records
 from reference.side_by_side import Quality, Run, judge, run_jaxtrack, run_stone_soup
 from reference.virtual_radar import observe_aircraft, scan_interval, write_detections

@@ -22,12 +22,13 @@ from stonesoup.types.angle import Angle, Bearing
 from stonesoup.types.track import Track
 
 from jaxtrack.episode import EnvState
-from jaxtrack.params import Params, StaticParams, validate
+from jaxtrack.params import Params, StaticParams
 from jaxtrack.platform import rotation, to_platform
 from jaxtrack.policies import PolicyBuilder
 from jaxtrack.scan_map import initial_scan_map, update_scan_map
 from jaxtrack.sensor import look_angles
 from jaxtrack.types import NEVER, NO_DETECTION, STATE_DIM, Tracks, Truths
+from jaxtrack.validation import validate
 from reference.components import EPOCH
 from reference.radar import build_radar
 from reference.stone_soup_objects import take_slots

@@ -6,8 +6,9 @@ from pathlib import Path
 from typing import Annotated, Any, get_args, get_origin
 
 from jaxtrack.cli import LARGEST_SEED
-from jaxtrack.params import Params, StaticParams, validate
+from jaxtrack.params import Params, StaticParams
 from jaxtrack.policies import POLICIES
+from jaxtrack.validation import validate
 from train.agents import AGENTS
 from train.early_stop import Thresholds, check_thresholds
 from train.networks import ENCODERS, HEADS

@@ -9,7 +9,8 @@ from typing import Annotated, Any, get_args
 
 import numpy as np
 
-from jaxtrack.params import Params, StaticParams, validate
+from jaxtrack.params import Params, StaticParams
+from jaxtrack.validation import validate
 from train.tables import read_number, table_option
 
 FIXED = ("field_limit", "beam_azimuth", "beam_elevation", "max_steps_in_episode", "trajectories")

@@ -8,10 +8,11 @@ from pathlib import Path
 from typing import Any
 
 from jaxtrack.cli import parse, require_file, require_integer, run, wide_console
-from jaxtrack.params import Params, with_unit
+from jaxtrack.params import Params
 from jaxtrack.policies import POLICIES
 from jaxtrack.report import circumstances, markdown_table
 from jaxtrack.scenarios import SCENARIOS, read_scenario
+from jaxtrack.validation import with_unit
 from train.evaluate import COMPARED_SEED, LARGEST_EPISODES, baselines, play
 from train.results import format_estimate
 from train.scenarios import build_scenario
