@@ -7,12 +7,13 @@ ARGS ?=
 
 export JAX_PLATFORMS ?= cpu
 
-.PHONY: help setup train test slow sb3 peers parity lint bench docs clean
+.PHONY: help setup train test medium slow sb3 peers parity lint bench docs clean
 
 help:
 	@echo "make train   train an agent, compare it with the baselines, draw pictures (runs/)"
 	@echo "make test    lint, types and all quick tests"
-	@echo "make slow    the tests that take longer"
+	@echo "make medium  the tests that take a little longer, which CI runs, too"
+	@echo "make slow    the tests that take minutes"
 	@echo "make sb3     the tests that need Stable-Baselines3, which it installs (with torch, 1 GB)"
 	@echo "make peers   the comparison with FilterPy, which it installs"
 	@echo "make parity  the parity table of the README, in full"
@@ -37,6 +38,9 @@ train: setup
 test: setup
 	@started=$$(date +%s); $(MAKE) --no-print-directory lint && $(BIN)/pytest -n auto --dist loadfile $(ARGS) && \
 	echo "make test took $$(( $$(date +%s) - started )) s"
+
+medium: setup
+	$(BIN)/pytest -m medium -n auto --dist loadfile $(ARGS)
 
 slow: setup
 	$(BIN)/pytest -m slow $(ARGS)

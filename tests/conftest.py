@@ -1,5 +1,7 @@
 """What all tests share: small scenarios, builders of records, and double precision on demand."""
 
+import gc
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -21,6 +23,13 @@ settings.register_profile(
 )
 settings.register_profile("thorough", settings.get_profile("jaxtrack"), max_examples=1000)
 settings.load_profile("jaxtrack")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def frozen():
+    """What a module leaves in JAX's caches is not searched for garbage again and again by the next ones."""
+    yield
+    gc.freeze()
 
 
 @pytest.fixture

@@ -30,11 +30,13 @@ def rows():
     return environment.measure(OPTIONS, STATIC, PARAMS, Progress(disable=True))
 
 
+@pytest.mark.medium
 def test_one_row_for_each_policy_and_number_of_environments(rows):
     cases = [(row["policy"], row["num_envs"]) for row in rows]
     assert cases == [("random", 2), ("pointing", 2)]
 
 
+@pytest.mark.medium
 def test_speeds_and_ratio(rows):
     for row in rows:
         medians = []
@@ -47,6 +49,7 @@ def test_speeds_and_ratio(rows):
         assert row["compile_seconds"] > 0
 
 
+@pytest.mark.medium
 def test_pointing_detects_and_tracks_on_both_sides(rows):
     for row in rows[1:]:
         ours, theirs = row["jaxtrack"], row["stone_soup"]
@@ -124,6 +127,7 @@ def test_environments_are_shared_out_where_they_can_and_may_be(monkeypatch, num_
     assert asked == expected
 
 
+@pytest.mark.medium
 def test_command_writes_all_and_prints_markdown(rows, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(environment, "measure", lambda *_: rows)
     file = tmp_path / "result.json"

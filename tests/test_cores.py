@@ -30,6 +30,7 @@ jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-4)
 """
 
 
+@pytest.mark.medium
 def test_two_cores_give_what_one_gives(quick_code):
     flags = [f"--{name}={str(value).lower()}" for name, value in quick_code.items()]
     quickly = {"JAX_DISABLE_MOST_OPTIMIZATIONS": "1", "XLA_FLAGS": " ".join(flags)}

@@ -13,8 +13,8 @@ GUIDE = ROOT / "docs/guide"
 PAGES = sorted(GUIDE.glob("*.md"))
 BLOCK = re.compile(r"```([^\n]*)\n(.*?)```", re.DOTALL)
 LANGUAGES = {"python", "python sb3", "sh"}
-LONG = ("train", "evaluate")
-"""Pages that train: they run with -m slow, in CI too."""
+LONG = ("change_the_scenario", "evaluate", "train", "write_a_policy")
+"""Pages that run with -m medium."""
 
 
 def blocks(page):
@@ -52,7 +52,7 @@ def folder(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     "page",
     [
-        pytest.param(page, id=page.stem, marks=[pytest.mark.slow] if page.stem in LONG else [])
+        pytest.param(page, id=page.stem, marks=[pytest.mark.medium] if page.stem in LONG else [])
         for page in PAGES
         if "sb3" not in page.name
     ],

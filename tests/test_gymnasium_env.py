@@ -72,7 +72,11 @@ def assert_same(ours, theirs, place=""):
         np.testing.assert_allclose(ours, theirs, rtol=1e-3, atol=1e-5, err_msg=place)
 
 
-@pytest.mark.parametrize("fields", [STOP, FIELDS], ids=["ends at different times", "ends together"])
+@pytest.mark.parametrize(
+    "fields",
+    [pytest.param(STOP, marks=pytest.mark.medium), FIELDS],
+    ids=["ends at different times", "ends together"],
+)
 def test_many_are_what_gymnasium_makes_of_as_many_single_ones(fields):
     same_step = {"autoreset_mode": AutoresetMode.SAME_STEP}
     sync = gymnasium.make_vec(

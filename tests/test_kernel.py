@@ -153,7 +153,7 @@ def step_together_and_alone(shapes):
 
 
 @pytest.mark.usefixtures("quick_compilation")
-@pytest.mark.parametrize("largest", [200, 5])
+@pytest.mark.parametrize("largest", [pytest.param(200, marks=pytest.mark.medium), 5])
 def test_together_a_scenario_steps_as_alone_however_large(monkeypatch, largest):
     monkeypatch.setitem(LARGEST_IN_ONE_KERNEL, "max_tracks", largest)
     for together, alone, record in step_together_and_alone(

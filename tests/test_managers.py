@@ -228,6 +228,7 @@ def slow_futures(state):
     return jax.lax.scan(one_step, (states, LOOKS), length=HORIZON + 1)[1]
 
 
+@pytest.mark.medium
 def test_rollout_collects_the_rewards_of_the_base_policy(scenes, slow):
     states = [jax.tree.map(lambda leaf, i=i: leaf[i], scenes) for i in range(12)]
     futures = np.stack([slow_futures(state) for state in states])

@@ -37,6 +37,7 @@ def found(states):
         return planning.measure(OPTIONS, STATIC, PARAMS, Progress(disable=True))
 
 
+@pytest.mark.medium
 def test_one_row_for_each_manager_and_number_of_states(found):
     cases = [(row["manager"], row["num_states"]) for row in found["rows"]]
     names = ["index", "uncertainty", "greedy", "rollout, 3 looks, 2 steps"]
@@ -54,6 +55,7 @@ def test_agents_decide_on_what_they_were_trained_to_observe():
         planning.managers(dataclasses.replace(OPTIONS, runs=(Path("nowhere"),)))
 
 
+@pytest.mark.medium
 def test_speeds_and_ratio(found):
     theirs = found["rows"][0]["decisions_per_second"]["median"]
     for row in found["rows"]:
@@ -63,6 +65,7 @@ def test_speeds_and_ratio(found):
         assert row["ratio"] == pytest.approx(speed["median"] / theirs)
 
 
+@pytest.mark.medium
 def test_all_decide_on_tracks_and_alike(found, states):
     # A raster of wide beams has just found all truths.
     assert 3 <= found["live_tracks"] <= STATIC.num_truths
@@ -98,6 +101,7 @@ def test_speeds_are_written_without_exponents():
     ]
 
 
+@pytest.mark.medium
 def test_command_writes_all_and_prints_markdown(found, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(planning, "measure", lambda *_: {**found, "different_decisions": 0})
     file = tmp_path / "result.json"

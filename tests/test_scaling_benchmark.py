@@ -88,6 +88,7 @@ def test_a_number_of_environments_that_devices_can_not_share_has_no_such_case(mo
     assert list(scaling.cases_along(AXES[-1], options, StaticParams())) == [1]
 
 
+@pytest.mark.medium
 def test_measuring(monkeypatch):
     axes = [axis for axis in AXES if axis.name in ("num_envs", "max_tracks")]
     monkeypatch.setattr(scaling, "AXES", axes)

@@ -25,16 +25,21 @@ pytestmark = pytest.mark.usefixtures("quick_compilation")
 STEPS = 3
 RECORDING = "a recording"
 """Beside the names: a file of aircraft."""
-QUICK, QUICKLY_DRAWN = ("accelerating",), ("turning", "swarm", "flying", "continuous")
-"""Those that the quick tests play; the others run with -m slow."""
+MEDIUM, MEDIUM_TO_DRAW = ("accelerating",), ("accelerating", "turning", "swarm", "flying")
+"""Those that CI plays and draws; the others run with -m slow."""
+QUICKLY_DRAWN = ("continuous",)
+"""That which is always drawn."""
 OF_SCENARIOS = ("num-truths", "max-tracks", "max-detections", "max-clutter")
 SMALL = {name: value for name, value in OPTIONS.items() if name.removeprefix("static.") not in OF_SCENARIOS}
 WORDS = [word for option, value in SMALL.items() for word in (f"--{option}", str(value))]
 LEARN = ["--total-steps", "64", "--warm-start-steps", "32", "--evaluation-episodes", "0"]
 
 
-def each(names, quick=QUICK):
-    return [pytest.param(name, marks=() if name in quick else pytest.mark.slow) for name in names]
+def each(names, medium=MEDIUM, quick=()):
+    def marks(name):
+        return () if name in quick else pytest.mark.medium if name in medium else pytest.mark.slow
+
+    return [pytest.param(name, marks=marks(name)) for name in names]
 
 
 def assert_has_fields(name, static, params):
@@ -154,7 +159,7 @@ def test_each_evaluates(name, short, monkeypatch, capsys):
     assert_has_fields(name, *played[0])
 
 
-@pytest.mark.parametrize("name", each(SCENARIOS, QUICKLY_DRAWN))
+@pytest.mark.parametrize("name", each(SCENARIOS, MEDIUM_TO_DRAW, QUICKLY_DRAWN))
 def test_each_renders(name, short, monkeypatch, tmp_path):
     drawn, save_frame = [], render.save_frame
 

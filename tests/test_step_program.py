@@ -39,21 +39,25 @@ def alone():
     return program.count(program.alone(StaticParams(), Params()))
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("name", TOGETHER)
 def test_a_step_of_many_environments_grows_no_dearer(together, name):
     assert 0 <= getattr(together, name) <= TOGETHER[name]
 
 
+@pytest.mark.medium
 @pytest.mark.parametrize("name", ALONE)
 def test_the_play_of_one_environment_grows_no_dearer(alone, name):
     assert 0 < getattr(alone, name) <= ALONE[name]
 
 
+@pytest.mark.medium
 def test_the_loop_over_environments_is_one_kernel(together):
     """All of `play` but the scan map; keys and the new truths of a new episode may be others."""
     assert 1 <= together.marked <= 4
 
 
+@pytest.mark.medium
 def test_stages_are_not_inlined(alone):
     assert alone.stages >= STAGES
 

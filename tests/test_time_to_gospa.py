@@ -48,7 +48,7 @@ def test_training_ends_at_the_first_evaluation_that_is_good_enough(monkeypatch, 
     assert 0 < found["compile_seconds"] <= found["evaluations"][0]["seconds"] <= found["seconds"]
 
 
-@pytest.mark.slow
+@pytest.mark.medium
 def test_the_evaluation_is_that_of_train_evaluate():
     static = StaticParams(num_truths=2, max_tracks=3, max_detections=2, map_size=8, num_looks=5)
     static = dataclasses.replace(static, observe_variances=True)

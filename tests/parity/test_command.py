@@ -59,7 +59,7 @@ OTHER_PARTS = [
 ]
 
 
-@pytest.mark.slow
+@pytest.mark.medium
 def test_the_quick_run(tmp_path, capsys):
     """Everything that the full run does, in small."""
     readme = tmp_path / "README.md"

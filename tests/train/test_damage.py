@@ -201,7 +201,9 @@ KINDS = (
 FILES = ("config.json", *(f"checkpoints/{update}.{end}" for update in UPDATES for end in ("npz", "json")))
 
 
-@pytest.mark.parametrize("number", [20, pytest.param(200, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "number", [pytest.param(20, marks=pytest.mark.medium), pytest.param(200, marks=pytest.mark.slow)]
+)
 def test_damage_is_never_loaded(intact, state, tmp_path, capsys, number):
     rng = np.random.default_rng(number)
     told = {"loaded": 0, "fell back": 0, "refused": 0}

@@ -1,6 +1,7 @@
 """The same seed leaves the same bytes in three processes: a training, and an evaluation of what it learned.
 
-pytest -m slow tests/train/test_determinism.py    # also at default shapes, compiled by each, and evaluated
+pytest -m medium tests/train/test_determinism.py
+pytest -m slow tests/train/test_determinism.py      # at default shapes, compiled by each, and evaluated
 """
 
 import os
@@ -75,7 +76,7 @@ def differing(folders):
     return [name for name in first if any(other[name] != first[name] for other in others)]
 
 
-@pytest.mark.slow
+@pytest.mark.medium
 def test_the_same_seed_leaves_the_same_bytes(tmp_path):
     """The first process compiles; the others find that and run at the same time."""
     settings = {

@@ -49,7 +49,7 @@ exact(shared.env.time, alone.env.time)
 """
 
 
-@pytest.mark.slow
+@pytest.mark.medium
 @pytest.mark.parametrize("encoder", ["beams", "bigru"])
 def test_two_devices_learn_what_one_learns(quick_code, encoder):
     flags = [f"--{name}={str(value).lower()}" for name, value in quick_code.items()]

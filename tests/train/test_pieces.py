@@ -42,7 +42,9 @@ def minibatch(inputs):
     return Sample(inputs, action, jnp.zeros(len(USED), bool), log_prob, **numbers)
 
 
-@pytest.mark.parametrize(("encoder", "head"), [("bigru", "factored"), ("mhsa", "beams")])
+@pytest.mark.parametrize(
+    ("encoder", "head"), [("bigru", "factored"), pytest.param("mhsa", "beams", marks=pytest.mark.medium)]
+)
 def test_short_lists_change_neither_gradients_nor_outputs(draw_variables, encoder, head):
     agent = build_agent(encoder, STATIC, Params(), head)
     inputs = jax.jit(jax.vmap(agent.features))(observations())

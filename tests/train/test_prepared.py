@@ -32,7 +32,13 @@ def looks(policy: Policy, params: Params) -> np.ndarray:
     return np.asarray(jax.lax.scan(one_step, start, jax.random.split(jax.random.key(2), STEPS))[1])
 
 
-@pytest.mark.parametrize("name", POLICIES)
+ALWAYS = ("random", "index_tuned", "sweep")
+"""Rules of every test run; the others with -m medium."""
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=() if name in ALWAYS else pytest.mark.medium) for name in POLICIES]
+)
 def test_acts_as_before(name: str) -> None:
     prepared = prepare(lambda weights: POLICIES[name], (), ENV, PARAMS)
     kept = prepared.work_out((), PARAMS)

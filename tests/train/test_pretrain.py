@@ -59,6 +59,7 @@ def test_the_encoder_learns_to_keep_lists_and_nothing_else_changes():
         assert all(jax.tree.leaves(same)) == (part != "track_list")
 
 
+@pytest.mark.medium
 def test_a_training_begins_with_it():
     env = SearchTrack(STATIC)
 

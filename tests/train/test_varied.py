@@ -196,6 +196,7 @@ def compiled_once(monkeypatch):
     monkeypatch.setattr(ppo, "compile_training", compile_or_take)
 
 
+@pytest.mark.medium
 @pytest.mark.usefixtures("compiled_once")
 def test_a_varied_training_resumes_bit_for_bit(tmp_path, monkeypatch):
     whole, parts = tmp_path / "whole", tmp_path / "parts"
