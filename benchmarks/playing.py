@@ -15,7 +15,8 @@ from jaxtrack.sampling import split
 
 Tree = TypeVar("Tree")
 Start = tuple[Observation, EnvState]
-"""Observation and state of environments `[B]`, from which a piece of an episode is played."""
+"""Observation, without the scan map that the state has, too, and state of environments `[B]`, from which a
+piece of an episode is played."""
 
 
 def pointing(static: StaticParams, params: Params) -> policies.Policy:
@@ -53,17 +54,24 @@ def play(
         observation, state, reward, _, _, info = jax.vmap(env.step, in_axes=(0, 0, 0, None))(
             keys, state, action, params
         )
-        del info["final_observation"]
+        del info["final_observation"], observation["scan_map"]
         return (observation, state), {**info, "reward": reward}
 
     end, logged = jax.lax.scan(one_step, start, of_steps)
     return end, jax.tree.map(lambda values: jnp.mean(values, axis=0), logged)
 
 
+def begin(keys: jax.Array, params: Params, env: SearchTrack) -> Start:
+    """New scenarios `[B]`, one for each key."""
+    observation, state = jax.vmap(env.reset, in_axes=(0, None))(keys, params)
+    del observation["scan_map"]
+    return observation, state
+
+
 def raster(key: jax.Array, params: Params, env: SearchTrack, num_envs: int) -> Start:
     """New scenarios `[B]` after one raster over the field, so that tracks exist."""
     reset_keys, play_keys = jax.random.split(key, (2, num_envs))
-    start = jax.vmap(env.reset, in_axes=(0, None))(reset_keys, params)
+    start = begin(reset_keys, params, env)
     return play(play_keys, start, params, env, policies.coverage, env.static.num_looks**2)[0]
 
 

@@ -15,7 +15,7 @@ import jax
 from rich.progress import Progress
 
 from benchmarks.operations import mean_seconds
-from benchmarks.playing import compile_play, pointing
+from benchmarks.playing import begin, compile_play, pointing
 from benchmarks.scaling_fit import AXES, Axis, draw, fit
 from jaxtrack.cli import parse, require_file, require_integer, require_positive, run, wide_console
 from jaxtrack.env import LARGEST_IN_ONE_KERNEL, make
@@ -113,8 +113,7 @@ class Program:
         env, self.params = make(params, case.static)
         self.num_envs, self.steps = case.num_envs, options.steps
         self.keys = jax.random.split(jax.random.key(options.seed), case.num_envs)
-        reset = jax.jit(jax.vmap(env.reset, in_axes=(0, None)))
-        start = reset(self.keys, self.params)
+        start = jax.jit(lambda keys, params: begin(keys, params, env))(self.keys, self.params)
         self.compiled, self.compile_seconds = compile_play(
             env, self.params, start, pointing, options.steps, shared=case.devices > 1
         )

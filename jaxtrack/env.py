@@ -78,7 +78,9 @@ class SearchTrack(environment.Environment[EnvState, Params]):
         last, moved, reward, terminated, info = self.step_env(key_step, state, action, params)
         truncated = self.is_truncated(moved, params)
         done = terminated | truncated
-        state = rarely(done, self._begin, (key_reset, params), moved)
+        # Never true, but once the reward is known nothing reads the old map: a CPU need not copy it.
+        renewed = done | (reward < -jnp.inf)
+        state = rarely(renewed, self._begin, (key_reset, params), moved)
         # Twice the same as long as no episode ends; but then mostly nobody asks for the final one.
         observation = self.observe(key_step, state, action, params)
         ended = {"terminated": terminated, "truncated": truncated, "final_observation": last}

@@ -58,13 +58,19 @@ def _edges(angles: jax.Array, look: jax.Array, params: Params) -> tuple[jax.Arra
         ``|y| cos(half) - x sin(half)`` and of -z.
     """
     # The grid has the same angles along both axes.
-    sine, cosine = jnp.sin(angles), jnp.cos(angles)
-    (azimuth_sine, look_sine), (azimuth_cosine, look_cosine) = jnp.sin(look), jnp.cos(look)
+    sine, cosine = _sine_and_cosine(angles)
+    (azimuth_sine, look_sine), (azimuth_cosine, look_cosine) = _sine_and_cosine(look)
     ahead = azimuth_cosine * cosine + azimuth_sine * sine
     aside = azimuth_cosine * sine - azimuth_sine * cosine
     half = params.beam_azimuth / 2
     margin = jnp.abs(aside) * jnp.cos(half) - look_cosine * ahead * jnp.sin(half)
     return cosine, look_sine * sine * jnp.sin(half), margin, look_cosine * sine, look_sine * ahead
+
+
+@stage
+def _sine_and_cosine(angles: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """A stage: a look's would be worked out anew for every row and column."""
+    return jnp.sin(angles), jnp.cos(angles)
 
 
 def grid_angles(static: StaticParams, params: Params) -> jax.Array:

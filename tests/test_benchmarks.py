@@ -104,6 +104,7 @@ def test_ours_counts_every_step_of_every_environment(monkeypatch):
     def played(*_):
         return start, {"num_detections": jnp.asarray(0.5), "live_tracks": jnp.asarray(2.0)}
 
+    played.input_shardings = jax.devices()[0], {}
     timing = environment.time_ours(played, jax.random.key(0), start, params, OPTIONS)
     assert timing == environment.Timing(steps_per_second=18.0, detections=0.5, live_tracks=2.0)
 
