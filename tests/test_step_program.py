@@ -6,13 +6,15 @@ improvement, set them anew.
 """
 
 import json
+import re
 
 import jax
 import jax.numpy as jnp
 import pytest
 
-from benchmarks import program
+from benchmarks import playing, program
 from jaxtrack import Params, StaticParams, make
+from jaxtrack.policies import random
 
 TOGETHER = {
     "operations": 5_000_000,
@@ -60,6 +62,21 @@ def test_the_loop_over_environments_is_one_kernel(together):
 @pytest.mark.medium
 def test_stages_are_not_inlined(alone):
     assert alone.stages >= STAGES
+
+
+@pytest.mark.medium
+def test_the_map_is_renewed_in_place(static, params):
+    """No step copies it: whether an episode ends hangs on the reward, the last that reads the old map."""
+    env, _ = make(params, static)
+    keys = jax.random.split(jax.random.key(0), 5)
+    start = playing.begin(keys, params, env)
+    lowered = jax.jit(lambda keys, start, params: playing.play(keys, start, params, env, random, 3)).lower(
+        keys, start, params
+    )
+    text = lowered.compile().as_text()
+    steps, maps = text[: text.index("\nENTRY")], re.escape(f"f32[5,{static.map_size},{static.map_size}]")
+    assert re.search(rf"= {maps}\S* fusion\(", steps)
+    assert not re.search(rf"= {maps}\S* copy\(", steps)
 
 
 def test_counting():
