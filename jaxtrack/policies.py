@@ -152,6 +152,7 @@ def gain(
     danger_weight: float = 3.0,
     danger_exponent: int = 8,
     planned: bool = False,
+    tracked_weight: float = 1.0,
 ) -> Policy:
     """The look with the largest gain.
 
@@ -169,6 +170,7 @@ def gain(
         danger_weight: worth of a track that is about to be deleted.
         danger_exponent: power of trace / deletion threshold.
         planned: the look whose turn it is in the search plan finds as much as the best.
+        tracked_weight: weight of searching while there are as many tracks as there can be truths.
     """
     looks, sizes = look_grid(static, params), beam_sizes(static, params)
     areas = (sizes / jnp.median(sizes)) ** area_exponent
@@ -184,6 +186,7 @@ def gain(
         need = removed / variance_scale + danger_weight * danger
         unseen = scan_values(state.scan_map**sharpness)
         found = plan.prefer_next(areas * unseen, unseen) if plan else areas * unseen
+        found *= jnp.where(jnp.sum(tracks.active) >= static.num_truths, tracked_weight, 1.0)
         return to_action(first_largest(found + sum_in_beams(need, tracks, looks, params)), static, params)
 
     return policy

@@ -1,5 +1,6 @@
 """Baselines: actions in range, blind to the truths, and each rule against plain numpy."""
 
+import dataclasses
 import functools
 
 import jax
@@ -248,6 +249,19 @@ def test_gain_takes_the_look_that_finds_most_field_unseen_and_helps_the_tracks_m
         assert any(need[tuple(look)] < need.max() for look, ((_, need), _) in zip(chosen, gains, strict=True))
     else:
         assert chosen != [largest(unseen + need) for _, (unseen, need) in gains]
+
+
+def test_gain_searches_less_while_there_are_as_many_tracks_as_truths():
+    patient = {"variance_scale": 5e4, "danger_weight": 0.1}
+    chosen = {}
+    for truths in (3, 4):  # these scenes have three tracks
+        static = dataclasses.replace(STATIC, num_truths=truths)
+        policy = jax.jit(gain(static, PARAMS, **patient, tracked_weight=0.25))
+        chosen[truths] = [policy(jax.random.key(0), scene(seed)).tolist() for seed in range(8)]
+    parts = [by_gain(scene(seed), **patient) for seed in range(8)]
+    assert chosen[4] == [largest(unseen + need) for unseen, need in parts]
+    assert chosen[3] == [largest(0.25 * unseen + need) for unseen, need in parts]
+    assert chosen[3] != chosen[4]
 
 
 def test_sweep_follows_the_search_plan_where_it_has_no_tracks():

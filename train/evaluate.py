@@ -138,7 +138,8 @@ def baselines(names: Sequence[str]) -> dict[str, Competitor]:
 def group_runs(runs: Sequence[tuple[Path, TrainConfig, Any]], greedy: bool) -> dict[str, Competitor]:
     """Runs that differ in their seed only, as one policy each, named after its encoder.
 
-    Where one encoder has several configurations, the name of the first run's folder is added.
+    Where one encoder has several configurations, the name of the first run's folder is added, and of the
+    folders above it as far as they are needed to tell them apart.
 
     Raises:
         ValueError: if a run is given twice.
@@ -154,13 +155,23 @@ def group_runs(runs: Sequence[tuple[Path, TrainConfig, Any]], greedy: bool) -> d
         else:
             members.append(one)
     encoders = [members[0][1].encoder for _, members in groups]
+    folders = told_apart([members[0][0] for _, members in groups])
     competitors = {}
-    for _, members in groups:
-        folder, config, _ = members[0]
-        name = config.encoder if encoders.count(config.encoder) == 1 else f"{config.encoder} ({folder.name})"
+    for (_, members), folder in zip(groups, folders, strict=True):
+        config = members[0][1]
+        name = config.encoder if encoders.count(config.encoder) == 1 else f"{config.encoder} ({folder})"
         seeds = tuple(config.seed for _, config, _ in members)
         competitors[name] = agent(config, [weights for _, _, weights in members], seeds, greedy)
     return competitors
+
+
+def told_apart(folders: Sequence[Path]) -> list[str]:
+    """The ends of different paths, of all as many names as it takes to tell them apart: a/seed0, b/seed0."""
+    for length in range(1, max((len(folder.parts) for folder in folders), default=1)):
+        names = [str(Path(*folder.parts[-length:])) for folder in folders]
+        if len({*names}) == len(names):
+            return names
+    return [str(folder) for folder in folders]
 
 
 def agent(

@@ -16,7 +16,7 @@ from jaxtrack.policies import POLICIES
 from tests.train.compared import THREE
 from train import evaluate
 from train.config import TrainConfig
-from train.evaluate import COMPARED_SEED, baselines, check_shapes, group_runs
+from train.evaluate import COMPARED_SEED, baselines, check_shapes, group_runs, told_apart
 from train.figures import FIGURES
 from train.scenarios import build_scenario
 
@@ -155,6 +155,21 @@ def test_runs_that_differ_in_their_seed_are_one_policy():
     assert list(group_runs([*runs, (Path("x/l"), longer, "l")], False)) == ["beams (a)", "mhsa", "beams (l)"]
     with pytest.raises(ValueError, match=r"^runs = 'x/again': seed 0 of this policy is given twice$"):
         group_runs([*runs, (Path("x/again"), beams, "again")], greedy=False)
+
+
+def test_policies_of_one_encoder_are_told_apart_by_their_paths():
+    several = [
+        (Path(folder) / "seed0", TrainConfig(total_steps=steps), folder)
+        for folder, steps in (("r/a", 10**6), ("r/b", 2 * 10**6))
+    ]
+    grouped = group_runs(several, greedy=False)
+    assert {name: one.weights for name, one in grouped.items()} == {
+        "beams (a/seed0)": ["r/a"],
+        "beams (b/seed0)": ["r/b"],
+    }
+    assert told_apart([]) == []
+    assert told_apart([Path("a"), Path("b/a")]) == ["a", "b/a"]
+    assert told_apart([Path("/c/a/x"), Path("/d/a/x")]) == ["c/a/x", "d/a/x"]
 
 
 def test_baselines_come_once_and_in_the_order_asked_for(monkeypatch):
