@@ -99,7 +99,7 @@ def test_ours_counts_every_step_of_every_environment(monkeypatch):
     clock = iter(range(0, 100, 2))
     monkeypatch.setattr(environment.time, "perf_counter", lambda: float(next(clock)))
     env, params = make(PARAMS, STATIC)
-    start = jax.vmap(env.reset, in_axes=(0, None))(jax.random.split(jax.random.key(0), 3), params)
+    start = playing.begin(jax.random.split(jax.random.key(0), 3), params, env)
 
     def played(*_):
         return start, {"num_detections": jnp.asarray(0.5), "live_tracks": jnp.asarray(2.0)}
@@ -123,7 +123,7 @@ def test_environments_are_shared_out_where_they_can_and_may_be(monkeypatch, num_
     monkeypatch.setattr(jax, "device_count", lambda: 2)
     monkeypatch.setattr(playing, "play", lambda keys, start, *_: (start, {}))
     env, params = make(PARAMS, STATIC)
-    start = jax.vmap(env.reset, in_axes=(0, None))(jax.random.split(jax.random.key(0), num_envs), params)
+    start = playing.begin(jax.random.split(jax.random.key(0), num_envs), params, env)
     playing.compile_play(env, params, start, playing.pointing, 3, shared=shared)
     assert asked == expected
 
