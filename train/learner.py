@@ -84,7 +84,7 @@ def train_step(
     agent = build_agent(config.encoder, env.static, state.scenario, config.head)
     key, key_rollout, key_update = jax.random.split(jax.random.wrap_key_data(state.key), 3)
     state, rollout, rollout_metrics = collect(key_rollout, state, env, agent, config, share)
-    samples = estimate_advantages(rollout, state, agent, config)
+    samples = estimate_advantages(rollout, config)
     weights, optimiser, losses = update_epochs(key_update, state, samples, agent, config, share)
     state = state.replace(
         weights=weights, optimiser=optimiser, key=jax.random.key_data(key), update=state.update + 1
@@ -94,12 +94,9 @@ def train_step(
     return state, {**rollout_metrics, **losses, "explained_variance": explained, **moved}
 
 
-def estimate_advantages(
-    rollout: Transition, state: LearnerState, agent: Agent, config: TrainConfig
-) -> Sample:
+def estimate_advantages(rollout: Transition, config: TrainConfig) -> Sample:
     """Advantages of the rollout `[S, B]`, bootstrapped from the value after its last step."""
-    _, last_value = agent.evaluate(state.weights, state.inputs)
-    following = jnp.concatenate([rollout.value[1:], last_value[None]])
+    following = jnp.concatenate([rollout.value[1:], rollout.final_value[-1:]])
     advantage = advantages(
         rollout.reward,
         rollout.value,

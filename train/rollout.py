@@ -23,7 +23,11 @@ LOGGED = ("completeness", "covariance_norm_mean", "covariance_norm_sum", "live_t
 
 
 class Transition(struct.PyTreeNode):
-    """One step of B environments, as the update needs it (`[B, ...]`, stacked to `[S, B, ...]`)."""
+    """One step of B environments, as the update needs it (`[B, ...]`, stacked to `[S, B, ...]`).
+
+    `final_value` is that of the observation it led to, before a new episode begins; 0 where none ended,
+    but for the last step of the rollout.
+    """
 
     inputs: Any
     action: jax.Array
@@ -48,7 +52,10 @@ def collect(
     choose = build_chooser(state, env, agent, config)
     taught = jnp.full(state.episode_length.shape, imitates(state, config))
 
-    def one_step(carry: LearnerState, key: jax.Array) -> tuple[LearnerState, tuple[Transition, Any, Any]]:
+    def one_step(
+        carry: LearnerState, now: tuple[jax.Array, jax.Array]
+    ) -> tuple[LearnerState, tuple[Transition, Any, Any]]:
+        key, is_last = now
         key_action, key_env = share.own(jax.random.split(key, (2, config.num_envs)), axis=1)
         logits, value = agent.evaluate_quickly(carry.weights, carry.inputs)
         action = choose(key_action, carry.env, logits)
@@ -62,7 +69,7 @@ def collect(
             taught=taught,
             log_prob=agent.distribution.log_prob(logits, action),
             value=value,
-            final_value=value_at_end(carry.weights, info["final_observation"], done, agent),
+            final_value=value_at_end(carry.weights, info["final_observation"], done | is_last, agent),
             reward=config.reward_scale * reward,
             terminated=terminated,
             done=done,
@@ -79,7 +86,8 @@ def collect(
         return carry, (transition, finished | {"terminated": terminated}, logged)
 
     keys = jax.random.split(key, config.rollout_steps)
-    state, (rollout, finished, logged) = jax.lax.scan(one_step, state, keys)
+    is_last = jnp.arange(len(keys)) == len(keys) - 1
+    state, (rollout, finished, logged) = jax.lax.scan(one_step, state, (keys, is_last))
     finished, logged = share.all((finished, logged), axis=1)
     return state, rollout, summarise(finished, logged, state.scenario)
 
@@ -107,17 +115,17 @@ def imitates(state: LearnerState, config: TrainConfig) -> jax.Array:
     return state.update < config.warm_start_updates
 
 
-def value_at_end(weights: Any, final_observation: Any, done: jax.Array, agent: Agent) -> jax.Array:
-    """Value `[B]` of the final observations; 0 where the episode goes on.
+def value_at_end(weights: Any, final_observation: Any, ended: jax.Array, agent: Agent) -> jax.Array:
+    """Value `[B]` of the final observations where the episode or the rollout has ended; 0 where both go on.
 
     Most steps end no episode: then nothing is computed.
     """
 
     def evaluate() -> jax.Array:
         _, value = agent.evaluate(weights, jax.vmap(agent.features)(final_observation))
-        return jnp.where(done, value, 0.0)
+        return jnp.where(ended, value, 0.0)
 
-    return jax.lax.cond(jnp.any(done), evaluate, lambda: jnp.zeros(done.shape))
+    return jax.lax.cond(jnp.any(ended), evaluate, lambda: jnp.zeros(ended.shape))
 
 
 def summarise(

@@ -152,8 +152,8 @@ def test_the_final_value_counts_exactly_where_an_episode_is_truncated(traced, te
 
     @jax.jit
     def roll(state):
-        after, rollout, _ = collect(jax.random.key(0), state, probe, agent, config)
-        return rollout, learner.estimate_advantages(rollout, after, agent, config)
+        _, rollout, _ = collect(jax.random.key(0), state, probe, agent, config)
+        return rollout, learner.estimate_advantages(rollout, config)
 
     rollout, samples = roll(state)
     time = np.argmax(rollout.inputs[..., :4], axis=-1)
@@ -161,7 +161,8 @@ def test_the_final_value_counts_exactly_where_an_episode_is_truncated(traced, te
     np.testing.assert_array_equal(rollout.done, time == 2)
     np.testing.assert_array_equal(rollout.terminated, (time == 2) & terminates)
     # The final observation is time 3, worth 40; the next episode's first is time 0, worth 10.
-    np.testing.assert_allclose(rollout.final_value, np.where(time == 2, 40.0, 0.0))
+    ended = (time == 2) | (np.arange(len(time)) == len(time) - 1)[:, None]  # the episode, or the rollout
+    np.testing.assert_allclose(rollout.final_value, np.where(ended, values[time + 1], 0.0))
     following = np.where((time == 2) & terminates, 0.0, values[time + 1])
     np.testing.assert_allclose(samples.advantage, 0.1 + 0.5 * following - values[time], rtol=1e-5)
 
