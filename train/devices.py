@@ -11,7 +11,6 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 
 from train.config import TrainConfig
@@ -41,16 +40,12 @@ class Share(NamedTuple):
             return parts
         return jax.tree.map(lambda leaf: jax.lax.all_gather(leaf, _AXIS, axis=axis, tiled=True), parts)
 
-    def add(self, parts: Any) -> Any:
-        """Sums of floating-point arrays over all devices."""
+    def add(self, part: jax.Array) -> jax.Array:
+        """Sum of an array over all devices."""
         if self.number == 1:
-            return parts
-        leaves, tree = jax.tree.flatten(parts)
-        # As one row: the devices wait for each other once for every array that is added up.
-        row = jax.lax.psum(jnp.concatenate([leaf.ravel() for leaf in leaves]), _AXIS)
-        added = jnp.split(row, np.cumsum([leaf.size for leaf in leaves])[:-1])
-        shaped = [part.reshape(leaf.shape) for part, leaf in zip(added, leaves, strict=True)]
-        return jax.tree.unflatten(tree, shaped)
+            return part
+        total: jax.Array = jax.lax.psum(part, _AXIS)
+        return total
 
 
 ALONE = Share()

@@ -8,6 +8,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jax.flatten_util import ravel_pytree
 
 from jaxtrack.kernel import stage
 from train.agents import Agent
@@ -61,7 +62,10 @@ def minibatch_gradient(
     shapes = jax.eval_shape(gradient, pieces[0])
     zeros = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
     total, _ = jax.lax.scan(add_piece, zeros, pieces)
-    return jax.tree.map(lambda leaf: leaf / (len(pieces) * share.number), share.add(total))
+    # As one row: the devices wait for each other once for every array that is added up.
+    row, unravel = ravel_pytree(total)
+    result: Any = unravel(share.add(row) / (len(pieces) * share.number))
+    return result
 
 
 def piece_gradient(
