@@ -4,6 +4,7 @@ import math
 import shlex
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
 import jax
@@ -60,10 +61,13 @@ def compile_training(run: Run, env: SearchTrack, console: Console) -> Programs:
     jitted: Any
     jitted, shapes = jit_training(env, config)
     init = jitted.init
-    with console.status("compiling (about half a minute)"):
+    with console.status("compiling (about half a minute)"), ThreadPoolExecutor(1) as pool:
+        # Side by side: much of compiling is work that only one core does.
         if run.state is None:
-            init = init.lower(jax.random.key(config.seed), config.params).compile()
+            first = pool.submit(init.lower(jax.random.key(config.seed), config.params).compile)
         step = jitted.step.lower(shapes).compile()
+        if run.state is None:
+            init = first.result()
     console.print(f"compiled in {time.perf_counter() - started:.1f} s; devices: {config.devices}")
     return Programs(init, step, jitted.places)
 
