@@ -62,7 +62,7 @@ def compile_training(run: Run, env: SearchTrack, console: Console) -> Programs:
     jitted, shapes = jit_training(env, config)
     init = jitted.init
     with console.status("compiling (about half a minute)"), ThreadPoolExecutor(1) as pool:
-        # Side by side: much of compiling is work that only one core does.
+        # Side by side: much of compiling keeps only one core busy.
         if run.state is None:
             first = pool.submit(init.lower(jax.random.key(config.seed), config.params).compile)
         step = jitted.step.lower(shapes).compile()
