@@ -8,7 +8,6 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import optax
-from jax.flatten_util import ravel_pytree
 
 from jaxtrack.env import SearchTrack
 from jaxtrack.params import Params
@@ -27,7 +26,8 @@ from train.varied import randomised, scenario_at
 def make_optimiser(config: TrainConfig) -> optax.GradientTransformation:
     """Adam on gradients clipped by their global norm.
 
-    The rate of the warm start is constant, the one after it annealed to zero.
+    The rate of the warm start is constant, the one after it annealed to zero. Its arithmetic is on all
+    weights as one row: it is then compiled once, and not once for every array of the network.
     """
     per_update = config.epochs * config.num_minibatches
     warm = config.warm_start_updates * per_update
@@ -35,7 +35,9 @@ def make_optimiser(config: TrainConfig) -> optax.GradientTransformation:
     left = max(1, config.num_updates * per_update - warm)
     rewarded = optax.linear_schedule(config.learning_rate, end, left)
     rate = optax.join_schedules([lambda _: config.warm_start_learning_rate, rewarded], [warm])
-    return optax.chain(optax.clip_by_global_norm(config.max_grad_norm), optax.adam(rate, eps=1e-5))
+    return optax.flatten(
+        optax.chain(optax.clip_by_global_norm(config.max_grad_norm), optax.adam(rate, eps=1e-5))
+    )
 
 
 def init_learner(key: jax.Array, scenario: Params, env: SearchTrack, config: TrainConfig) -> LearnerState:
@@ -116,42 +118,28 @@ def update_epochs(
     """PPO's epochs: each shuffles all samples and takes an optimiser step per minibatch.
 
     Once the policy has gone too far (`target_kl`) no step is taken any more, as in Stable-Baselines3.
-    Weights, and moments of their gradients, are one row each meanwhile: the optimiser's arithmetic is then
-    compiled once, and not once for every array of the network.
     """
     flat = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), samples)
     optimiser = make_optimiser(config)
-    _, unravel = ravel_pytree(state.weights)
+
     farthest = jnp.where(imitates(state, config), jnp.inf, 1.5 * config.target_kl or jnp.inf)
 
     def one_minibatch(carry: tuple[Any, Any, jax.Array], rows: jax.Array) -> tuple[Any, Any]:
         weights, optimiser_state, near = carry
         rows = shortest_first(rows, flat.inputs, agent)
-        gradient, losses = minibatch_gradient(unravel(weights), flat, rows, agent, config, share)
-        gradient, _ = ravel_pytree(gradient)
+        grads, losses = minibatch_gradient(weights, flat, rows, agent, config, share)
         near &= losses["approximate_kl"] <= farthest
-        updates, moved = optimiser.update(gradient, optimiser_state, weights)
+        updates, moved = optimiser.update(grads, optimiser_state, weights)
         taken = (optax.apply_updates(weights, updates), moved)
         kept = jax.tree.map(lambda new, old: jnp.where(near, new, old), taken, (weights, optimiser_state))
-        return (*kept, near), losses | {"gradient_norm": optax.tree.norm(gradient), "steps_taken": near * 1.0}
+        return (*kept, near), losses | {"gradient_norm": optax.tree.norm(grads), "steps_taken": near * 1.0}
 
     def one_epoch(carry: Any, key: jax.Array) -> tuple[Any, Any]:
         return jax.lax.scan(one_minibatch, carry, shuffled(key, config, share))
 
-    carry = (*as_rows((state.weights, state.optimiser), state.weights), jnp.asarray(True))
+    carry = (state.weights, state.optimiser, jnp.asarray(True))
     (weights, moments, _), losses = jax.lax.scan(one_epoch, carry, jax.random.split(key, config.epochs))
-    moments = jax.tree.map(lambda leaf: unravel(leaf) if leaf.shape == weights.shape else leaf, moments)
-    return unravel(weights), moments, jax.tree.map(jnp.mean, losses)
-
-
-def as_rows(tree: Any, weights: Any) -> Any:
-    """A tree in which every part that is shaped like the weights is one row of numbers."""
-    shapes = jax.tree.map(jnp.shape, weights)
-
-    def alike(part: Any) -> bool:
-        return jax.tree.map(jnp.shape, part) == shapes
-
-    return jax.tree.map(lambda part: ravel_pytree(part)[0] if alike(part) else part, tree, is_leaf=alike)
+    return weights, moments, jax.tree.map(jnp.mean, losses)
 
 
 def shuffled(key: jax.Array, config: TrainConfig, share: Share) -> jax.Array:
