@@ -39,7 +39,7 @@ class ManagerOptions:
 
     policy: str = "index"
     """Name of a policy or planner: random, static, coverage, stalest, scheduler, index, index_tuned,
-    gain, sweep, greedy, rollout, uncertainty."""
+    gain, sweep, sweep_then_track, greedy, rollout, uncertainty."""
     run: Path | None = None
     """Folder of a trained run, whose agent steers instead, in the scenario that it was trained on."""
     greedy: bool = False

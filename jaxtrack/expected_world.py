@@ -17,7 +17,7 @@ from jaxtrack import kalman
 from jaxtrack.beam_means import beam_means
 from jaxtrack.env import one_by_one_if_small
 from jaxtrack.lifecycle import delete_uncertain_tracks
-from jaxtrack.observation import covariance_norms
+from jaxtrack.observation import confirmed, covariance_norms, variances
 from jaxtrack.params import Params, StaticParams
 from jaxtrack.policies import sum_in_beams
 from jaxtrack.reward import TRACK_TERMS, reward_terms
@@ -64,6 +64,8 @@ def expected_rewards(
     aged = update_scan_map(state.scan_map, jnp.full(2, jnp.nan), static, params)  # NaN looks nowhere
     sharp = aged**static.search_sharpness
     scan_value = mean_scan_value(sharp) - pixels(sharp) / sharp.size
+    if static.search_until_complete:
+        scan_value = jnp.where(_completes(predicted, updated, looks, static, params), 0.0, scan_value)
     return params.track_weight * track - params.search_weight * scan_value
 
 
@@ -119,6 +121,19 @@ def _worths(before: Tracks, after: Tracks, static: StaticParams, params: Params)
     # Track lists of one track each.
     alone = jax.tree.map(lambda leaf: leaf[:, None], (before, after))
     return jax.vmap(lambda before, after: term(before, after, _no_truths(), static, params))(*alone)
+
+
+def _completes(
+    predicted: Tracks, updated: Tracks, looks: jax.Array, static: StaticParams, params: Params
+) -> jax.Array:
+    """`[A]` whether after a look there are as many confirmed tracks as there can be truths."""
+
+    def sure(tracks: Tracks) -> jax.Array:
+        left = delete_uncertain_tracks(tracks, params)
+        return confirmed(left.active, variances(left)[:, 1], params).astype(float)
+
+    missed, detected = sure(predicted), sure(updated)
+    return jnp.sum(missed) + sum_in_beams(detected - missed, predicted, looks, params) >= static.num_truths
 
 
 def _no_truths() -> Truths:

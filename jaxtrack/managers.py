@@ -33,6 +33,7 @@ def greedy(
     reward: str = "information",
     search_weight: float | None = None,
     search_sharpness: int | None = None,
+    search_until_complete: bool | None = None,
 ) -> Policy:
     """The look with the largest expected reward of the next step.
 
@@ -42,11 +43,12 @@ def greedy(
         reward: one of `REWARDS`.
         search_weight: weight of the reward's search term, if not that of `params`.
         search_sharpness: power of the scan values in it, if not that of `static`.
+        search_until_complete: whether it is 0 while there is nothing left to find, if not as in `static`.
 
     Raises:
         ValueError: naming the reward, if it needs truths or does not exist.
     """
-    static, params = _planned(static, params, reward, search_weight, search_sharpness)
+    static, params = _planned(static, params, reward, search_weight, search_sharpness, search_until_complete)
     looks, pixels = look_grid(static, params), beam_pixels(static, params)
 
     def policy(key: jax.Array, state: "EnvState") -> jax.Array:
@@ -69,6 +71,7 @@ def rollout(
     reward: str = "information",
     search_weight: float | None = None,
     search_sharpness: int | None = None,
+    search_until_complete: bool | None = None,
 ) -> Policy:
     """The look after which a base policy collects most reward in the expected world.
 
@@ -85,6 +88,7 @@ def rollout(
         reward: one of `REWARDS`.
         search_weight: weight of the reward's search term, if not that of `params`.
         search_sharpness: power of the scan values in it, if not that of `static`.
+        search_until_complete: whether it is 0 while there is nothing left to find, if not as in `static`.
 
     Raises:
         ValueError: naming the argument and its range.
@@ -96,7 +100,7 @@ def rollout(
         raise ValueError(f"horizon = {horizon}: expected an integer >= 0")
     if not 0 <= discount <= 1:
         raise ValueError(f"discount = {discount}: expected a number in [0, 1]")
-    static, params = _planned(static, params, reward, search_weight, search_sharpness)
+    static, params = _planned(static, params, reward, search_weight, search_sharpness, search_until_complete)
     looks, pixels = look_grid(static, params), beam_pixels(static, params)
     base_policy = base(static, params)
 
@@ -132,7 +136,12 @@ def uncertainty(static: StaticParams, params: Params) -> Policy:
     return policy
 
 
-PLAN: dict[str, Any] = {"reward": "shortfall", "search_weight": 10.0, "search_sharpness": 16}
+PLAN: dict[str, Any] = {
+    "reward": "shortfall",
+    "search_weight": 10.0,
+    "search_sharpness": 16,
+    "search_until_complete": True,
+}
 """What the managers by name plan for, whatever the environment pays: an expected world finds no new
 tracks, so that searching must be worth something in itself."""
 
@@ -170,11 +179,16 @@ def _planned(
     reward: str,
     search_weight: float | None,
     search_sharpness: int | None,
+    search_until_complete: bool | None,
 ) -> tuple[StaticParams, Params]:
     """The scenario with the reward that is planned for."""
     if reward not in REWARDS:
         raise ValueError(f"reward = {reward!r}: expected one of {', '.join(REWARDS)}, which need no truths")
     if search_weight is not None:
         params = dataclasses.replace(params, search_weight=search_weight)
-    sharpness = static.search_sharpness if search_sharpness is None else search_sharpness
-    return dataclasses.replace(static, reward=reward, search_sharpness=sharpness), params
+    asked: dict[str, Any] = {
+        "search_sharpness": search_sharpness,
+        "search_until_complete": search_until_complete,
+    }
+    chosen = {name: value for name, value in asked.items() if value is not None}
+    return dataclasses.replace(static, reward=reward, **chosen), params

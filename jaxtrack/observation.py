@@ -4,11 +4,14 @@ import jax
 import jax.numpy as jnp
 
 from jaxtrack.models import elevation_bearing_range
-from jaxtrack.params import Params
+from jaxtrack.params import Params, StaticParams
 from jaxtrack.types import STATE_DIM, Tracks, position, velocity
 
 TRACK_FEATURES = 7
 """Range, azimuth, elevation, vx, vy, vz, Frobenius norm of the covariance."""
+
+CONFIRMED_SHARE = 0.9
+"""A track is confirmed once the variance of its velocity is below this share of a new track's."""
 
 Observation = dict[str, jax.Array]
 
@@ -49,6 +52,24 @@ def variances(tracks: Tracks) -> jax.Array:
     """Sums `[T, 2]` over the axes of the variances of position (m^2) and of velocity (m^2/s^2)."""
     of_state = jnp.diagonal(tracks.covariance, axis1=-2, axis2=-1)
     return jnp.stack([position(of_state).sum(axis=-1), velocity(of_state).sum(axis=-1)], axis=-1)
+
+
+def confirmed(active: jax.Array, of_velocity: jax.Array, params: Params) -> jax.Array:
+    """`[T]` whether a track is one of more than one detection: its velocity is known better than a new one's.
+
+    A false track rarely is.
+
+    Args:
+        active: `[T]` where there is a track.
+        of_velocity: `[T]` variance of its velocity, the sum over the axes (m^2/s^2).
+        params: numbers; the standard deviation of a new track's velocity.
+    """
+    return active & (of_velocity < CONFIRMED_SHARE * 3 * params.prior_velocity_sigma**2)
+
+
+def complete(tracks: Tracks, static: StaticParams, params: Params) -> jax.Array:
+    """`[]` whether there are as many confirmed tracks as there can be truths."""
+    return jnp.sum(confirmed(tracks.active, variances(tracks)[:, 1], params)) >= static.num_truths
 
 
 def feature_scales(params: Params) -> jax.Array:

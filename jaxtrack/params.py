@@ -83,6 +83,8 @@ class StaticParams:
     search_sharpness: int = 1
     """Power of every scan value in the reward's search term; a high one counts only what was never
     seen, or long ago."""
+    search_until_complete: bool = False
+    """The reward's search term is 0 while there are as many confirmed tracks as there can be truths."""
     info_metrics: tuple[str, ...] = ()
     """More metrics of every step for `info`, by name; `jaxtrack.metrics.METRICS` lists them."""
     stop_metric: str | None = None

@@ -19,7 +19,7 @@ import jax.numpy as jnp
 from jaxtrack.beam_means import beam_means
 from jaxtrack.kernel import one_by_one
 from jaxtrack.models import elevation_bearing_range
-from jaxtrack.observation import variances
+from jaxtrack.observation import complete, variances
 from jaxtrack.params import Params, StaticParams
 from jaxtrack.sampling import draw_index, first_largest
 from jaxtrack.scan_map import beam_sizes, look_grid
@@ -170,7 +170,7 @@ def gain(
         danger_weight: worth of a track that is about to be deleted.
         danger_exponent: power of trace / deletion threshold.
         planned: the look whose turn it is in the search plan finds as much as the best.
-        tracked_weight: weight of searching while there are as many tracks as there can be truths.
+        tracked_weight: weight of searching while there are as many confirmed tracks as there can be truths.
     """
     looks, sizes = look_grid(static, params), beam_sizes(static, params)
     areas = (sizes / jnp.median(sizes)) ** area_exponent
@@ -186,7 +186,7 @@ def gain(
         need = removed / variance_scale + danger_weight * danger
         unseen = scan_values(state.scan_map**sharpness)
         found = plan.prefer_next(areas * unseen, unseen) if plan else areas * unseen
-        found *= jnp.where(jnp.sum(tracks.active) >= static.num_truths, tracked_weight, 1.0)
+        found *= jnp.where(complete(tracks, static, params), tracked_weight, 1.0)
         return to_action(first_largest(found + sum_in_beams(need, tracks, looks, params)), static, params)
 
     return policy
@@ -208,6 +208,7 @@ POLICIES: dict[str, PolicyBuilder] = {
     ),
     "gain": gain,
     "sweep": partial(gain, planned=True),
+    "sweep_then_track": partial(gain, planned=True, tracked_weight=0.003),
 }
 
 

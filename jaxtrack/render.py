@@ -154,7 +154,8 @@ class Options:
     """Plays one episode and draws it."""
 
     policy: str = "index"
-    """Policy by name: random, static, coverage, stalest, scheduler, index, index_tuned, gain or sweep."""
+    """Policy by name: random, static, coverage, stalest, scheduler, index, index_tuned, gain, sweep or
+    sweep_then_track."""
     scenario: str = "paper"
     """Scenario by name, or a file: as in train.evaluate; the datasheet lists them."""
     seed: int = 0

@@ -1,7 +1,8 @@
 """Rewards by name: pure functions of the track list before and after a step.
 
 Every reward is ``track_weight * track term - search_weight * mean of scan value ** search_sharpness``;
-they differ in the track term. Only `gospa` reads the truths, which no real radar knows.
+they differ in the track term. Only `gospa` reads the truths, which no real radar knows. With
+`search_until_complete` the search term is 0 while there is nothing left to find.
 """
 
 from collections.abc import Callable
@@ -10,7 +11,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxtrack.metrics import gospa
-from jaxtrack.observation import covariance_norms
+from jaxtrack.observation import complete, covariance_norms
 from jaxtrack.params import Params, StaticParams
 from jaxtrack.scan_map import mean_scan_value
 from jaxtrack.types import NO_DETECTION, Tracks, Truths
@@ -123,4 +124,6 @@ def reward_terms(
     """Weighted track term and weighted search term (negative); the reward is their sum."""
     track = params.track_weight * TRACK_TERMS[static.reward](before, after, truths, static, params)
     search = -params.search_weight * mean_scan_value(scan_map, static.search_sharpness)
+    if static.search_until_complete:
+        search = jnp.where(complete(after, static, params), 0.0, search)
     return track, search

@@ -7,16 +7,18 @@ import numpy as np
 from stonesoup.types.track import Track
 from stonesoup.types.update import Update
 
+from jaxtrack.observation import CONFIRMED_SHARE
 from jaxtrack.params import Params, StaticParams
 from jaxtrack.reward import LOST_STEPS
 
 
 @dataclass(frozen=True)
 class Uncertainty:
-    """What a reward reads of one track: norm and trace of P, and whether a detection is in it now."""
+    """What a reward reads of one track: norm of P, its trace and velocity's part, whether it is detected."""
 
     norm: float
     trace: float
+    velocity_trace: float
     detected: bool
 
 
@@ -30,10 +32,27 @@ def snapshot(tracks: Iterable[Track]) -> Snapshot:
         track: Uncertainty(
             norm=float(np.linalg.norm(track.covar)),
             trace=float(np.trace(track.covar)),
+            velocity_trace=float(np.diag(track.covar)[1::2].sum()),
             detected=isinstance(track.state, Update),
         )
         for track in tracks
     }
+
+
+def search_term(after: Snapshot, scan_map: np.ndarray, static: StaticParams, params: Params) -> float:
+    """The search term: minus the mean of a power of the scan values, or 0 if there is nothing left to find.
+
+    Args:
+        after: the tracks after the step.
+        scan_map: `[M, M]` after it.
+        static: shapes and choices.
+        params: numbers.
+    """
+    new = 3 * params.prior_velocity_sigma**2
+    confirmed = sum(track.velocity_trace < CONFIRMED_SHARE * new for track in after.values())
+    if static.search_until_complete and confirmed >= static.num_truths:
+        return 0.0
+    return -float((scan_map**static.search_sharpness).mean())
 
 
 def track_term(

@@ -18,7 +18,7 @@ from jaxtrack.params import Params, StaticParams
 from reference.components import build_components, gospa_metric, time_of
 from reference.observation import ScanMap, TrackSlots, track_observation
 from reference.radar import build_radar, steer
-from reference.reward import snapshot, track_term
+from reference.reward import search_term, snapshot, track_term
 from reference.translate import to_position
 from reference.truths import Draws, Script, initial_states, num_initial, scripted_simulator, truth_simulator
 
@@ -95,17 +95,17 @@ class StoneSoupScenario:
         self.slots.update(self.tracks)
         self.scan_map.look(azimuth, elevation)
         scan_map = self.scan_map.value
-        unseen = float((scan_map**self.static.search_sharpness).mean())
         gospa = self.gospa() if self.static.reward == "gospa" else 0.0
         after, living = snapshot(self.tracks), len(self.paths)
         track = track_term(before, after, gospa, living, self.static, self.params)
+        search = search_term(after, scan_map, self.static, self.params)
         return self.observe(), {
             "live_tracks": len(self.tracks),
             "num_detections": len(detections),
             "covariance_norm_sum": self.covariance_norm_sum(),
             "mean_scan_value": float(scan_map.mean()),
             "reward_track": self.params.track_weight * track,
-            "reward_search": -self.params.search_weight * unseen,
+            "reward_search": self.params.search_weight * search,
         }
 
     @property

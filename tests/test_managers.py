@@ -35,10 +35,14 @@ STATIC = StaticParams(num_truths=3, max_tracks=T, map_size=16, num_looks=L)
 # Managers do not read the environment's reward, which here needs truths.
 CONTINUOUS = dataclasses.replace(STATIC, continuous_actions=True, reward="gospa")
 # Beams that overlap and hold several tracks; steps long enough for predictions to matter.
-PARAMS = Params(beam_azimuth=0.8, beam_elevation=0.7, time_step=0.1, track_weight=0.8)
+PARAMS = Params(
+    beam_azimuth=0.8, beam_elevation=0.7, time_step=0.1, track_weight=0.8, prior_velocity_sigma=45.0
+)
 LOOKS = look_grid(STATIC, PARAMS)
 KEY = jax.random.key(0)
 FEW, HORIZON, DISCOUNT = 3, 6, 0.7
+HEAVY = 30.0  # a search weight with which other looks win
+UNTIL = dataclasses.replace(STATIC, num_truths=4, reward="shortfall", search_until_complete=True)
 PLANNER = functools.partial(rollout, candidates=FEW, horizon=HORIZON, discount=DISCOUNT)
 BUILDERS = {**MANAGERS, "rollout": PLANNER}
 
@@ -107,6 +111,9 @@ def slow_rewards(state, look, params):
         )
         for name in REWARDS
     }
+    heavy = params.replace(search_weight=HEAVY)
+    terms = reward_terms(state.tracks, after.tracks, state.truths, after.scan_map, UNTIL, heavy)
+    rewards["until complete"], rewards["search"] = sum(terms), terms[1]
     fall = covariance_norms(info.predicted) - covariance_norms(info.updated)
     rewards["fall"] = jnp.where(state.tracks.active, fall, 0.0).sum()
     return after, rewards, info.initiated.any() | (info.deleted & ~state.tracks.active).any()
@@ -184,6 +191,22 @@ def test_search_pays_by_its_sharpness(scenes, slow):
     actions = act_on_all(functools.partial(build, search_sharpness=4), scenes)
     assert_best(actions, values, margin=1e-5)
     assert (actions != act_on_all(build, scenes)).any()
+
+
+def test_search_pays_until_all_truths_have_confirmed_tracks(scenes, slow):
+    _, rewards = slow
+    ended = rewards["search"] == 0
+    assert (ended.any(axis=1) & ~ended.all(axis=1)).any(), "by a look at the right track alone"
+    assert ended.all(axis=1).any()
+    params = PARAMS.replace(search_weight=HEAVY)
+    pixels = beam_pixels(UNTIL, params)
+    expected = jax.jit(jax.vmap(lambda state: expected_rewards(state, LOOKS, pixels, UNTIL, params)))
+    np.testing.assert_allclose(expected(scenes), rewards["until complete"], rtol=1e-4, atol=1e-4)
+    build = functools.partial(greedy, reward="shortfall", search_weight=HEAVY)
+    actions = act_on_all(functools.partial(build, search_until_complete=True), scenes, UNTIL)
+    assert_best(actions, rewards["until complete"], margin=1e-5)
+    always = functools.partial(build, search_until_complete=False)
+    assert (actions != act_on_all(always, scenes, UNTIL)).any()
 
 
 def test_expected_step_is_that_of_the_tracker(scenes, slow):

@@ -251,17 +251,25 @@ def test_gain_takes_the_look_that_finds_most_field_unseen_and_helps_the_tracks_m
         assert chosen != [largest(unseen + need) for _, (unseen, need) in gains]
 
 
-def test_gain_searches_less_while_there_are_as_many_tracks_as_truths():
+@pytest.mark.parametrize(
+    ("truths", "sigma", "weight"),
+    [
+        (3, 100.0, 0.25),  # these scenes have three tracks, all known better than new ones of this spread
+        (4, 100.0, 1.0),
+        (3, 1.0, 1.0),  # and here none is
+    ],
+)
+def test_gain_searches_less_while_there_are_as_many_confirmed_tracks_as_truths(truths, sigma, weight):
     patient = {"variance_scale": 5e4, "danger_weight": 0.1}
-    chosen = {}
-    for truths in (3, 4):  # these scenes have three tracks
-        static = dataclasses.replace(STATIC, num_truths=truths)
-        policy = jax.jit(gain(static, PARAMS, **patient, tracked_weight=0.25))
-        chosen[truths] = [policy(jax.random.key(0), scene(seed)).tolist() for seed in range(8)]
+    static, params = (
+        dataclasses.replace(STATIC, num_truths=truths),
+        PARAMS.replace(prior_velocity_sigma=sigma),
+    )
+    policy = jax.jit(gain(static, params, **patient, tracked_weight=0.25))
+    chosen = [policy(jax.random.key(0), scene(seed)).tolist() for seed in range(8)]
     parts = [by_gain(scene(seed), **patient) for seed in range(8)]
-    assert chosen[4] == [largest(unseen + need) for unseen, need in parts]
-    assert chosen[3] == [largest(0.25 * unseen + need) for unseen, need in parts]
-    assert chosen[3] != chosen[4]
+    assert chosen == [largest(weight * unseen + need) for unseen, need in parts]
+    assert chosen != [largest((1.25 - weight) * unseen + need) for unseen, need in parts]
 
 
 def test_sweep_follows_the_search_plan_where_it_has_no_tracks():

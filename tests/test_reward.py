@@ -113,6 +113,26 @@ def test_rewards_by_name_are_weighted_and_searching_costs_the_mean_scan_value(na
     assert float(terms[1]) == pytest.approx(-0.5 * (0 + 1 + 0.25 + 0.01) / 4)
 
 
+def test_search_costs_nothing_while_all_truths_have_confirmed_tracks():
+    """Four truths; confirmed is below 0.9 of a new track's variance of velocity, 3 x 30^2 = 2700 (m/s)^2."""
+    static = StaticParams(num_truths=4, search_until_complete=True)
+    scan_map = jnp.full((2, 2), 0.5)
+
+    def search(of_velocity, active=(True,) * 4):
+        tracks = track_list([1.0] * 4, [NONE] * 4, active=list(active))
+        spread = jnp.zeros((4, 6, 6)).at[:, 1, 1].set(jnp.asarray(of_velocity)).at[:, 0, 0].set(5000.0)
+        tracks = tracks.replace(covariance=spread)
+        _, term = reward_terms(tracks, tracks, NOBODY, scan_map, static, PARAMS.replace(search_weight=2.0))
+        return float(term)
+
+    known, new = 2429.0, 2431.0
+    assert search([known] * 4) == 0
+    assert search([known, known, new, known]) == -1, "a track of one detection may be false"
+    assert search([known] * 4, [True, True, False, True]) == -1
+    static = StaticParams(num_truths=5, search_until_complete=True)
+    assert search([known] * 4) == -1
+
+
 def test_gospa_is_worth_one_for_perfect_tracks_and_nothing_without_any():
     params = PARAMS.replace(gospa_cutoff=100.0)
     state = jnp.zeros((4, 6)).at[:, 0].set(jnp.array([1000.0, 3000.0, 5000.0, 7000.0]))

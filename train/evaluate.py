@@ -50,7 +50,7 @@ class EvaluateOptions:
 
     policies: tuple[str, ...] = (ALL,)
     """Names of baselines: random, static, coverage, stalest, scheduler, index, index_tuned, gain,
-    sweep, or "all";
+    sweep, sweep_then_track, or "all";
     and of planners: greedy, rollout, uncertainty, or "planners". No name after the option for none."""
     runs: Annotated[tuple[Path, ...], tyro.conf.arg(aliases=["--run"])] = ()
     """Folders of trained runs, or of several seeds; runs that differ in nothing but their seed are one

@@ -28,7 +28,7 @@ class Options:
 
     scenarios: tuple[str, ...] = tuple(SCENARIOS)
     """Scenarios by name or file, as in train.evaluate."""
-    policies: tuple[str, ...] = ("random", "index_tuned", "sweep")
+    policies: tuple[str, ...] = ("random", "index_tuned", "sweep", "sweep_then_track")
     """Baselines by name."""
     episodes: int = 50
     """Episodes of each policy on each scenario; all policies meet the same ones."""

@@ -1,5 +1,6 @@
 """Stone Soup inside Gymnasium: its checkers, its seeds, and whole episodes against ours."""
 
+import dataclasses
 from types import SimpleNamespace
 
 import gymnasium
@@ -19,6 +20,7 @@ from reference.parity.environment import (
     Played,
     compare_environment,
     environment_rows,
+    play_ours,
 )
 
 pytestmark = pytest.mark.usefixtures("quick_compilation")
@@ -49,6 +51,19 @@ def test_an_episode_of_the_papers_scenario_equals_ours():
     divergence = compare_environment(STATIC, params, 1, STEPS, TOLERANCE, tallies)
     assert divergence is None, str(divergence)
     assert tallies.truths.compared == STEPS * STATIC.num_truths
+
+
+def test_the_search_term_ends_with_the_same_track():
+    """Three truths: while all have confirmed tracks searching costs nothing, here and there."""
+    static = dataclasses.replace(STATIC, num_truths=3, reward="shortfall", search_until_complete=True)
+    params, tallies = Params(time_step=0.02, deletion_threshold=20000.0), EnvironmentTallies()
+    divergence = compare_environment(static, params, 2, STEPS, TOLERANCE, tallies)
+    assert divergence is None, str(divergence)
+    always = dataclasses.replace(static, search_until_complete=False, reward=REWARDS[0])
+    until = dataclasses.replace(always, search_until_complete=True)
+    kept, other = (play_ours(shape, params, 2, STEPS).rewards["shortfall"] for shape in (until, always))
+    ended = np.flatnonzero(kept != other)
+    assert 10 < len(ended) < STEPS - 10, "in part of the episode"
 
 
 class Path(list):

@@ -85,7 +85,8 @@ def test_without_out_nothing_is_written(monkeypatch, tmp_path, capsys):
         (
             ["--policies", "index", "best"],
             "policies = 'best': expected all, planners, or some of random, static, coverage, stalest, "
-            "scheduler, index, index_tuned, gain, sweep, greedy, rollout, uncertainty",
+            "scheduler, index, index_tuned, gain, sweep, sweep_then_track, greedy, rollout, "
+            "uncertainty",
         ),
         (["--policies"], "policies: expected at least one name, or a run"),
         (["--scenario", "moon"], "scenario = 'moon': expected paper, clutter, births, agile, turning, "),
