@@ -13,7 +13,7 @@ from flax import struct
 
 from jaxtrack.beam_means import beam_means
 from jaxtrack.models import direction
-from jaxtrack.observation import Observation
+from jaxtrack.observation import Observation, confirmed
 from jaxtrack.params import Params, StaticParams
 from jaxtrack.policies import removed_variance
 from jaxtrack.scan_map import beam_sizes, look_grid
@@ -55,15 +55,16 @@ class BeamInputs(struct.PyTreeNode):
             look nearest to the track, and where variances are observed: them and their roots, the
             variance that a detection would remove and its root, and the danger of deletion.
         mask: `[..., T]` where there is a track.
-        context: `[..., 6]` share of slots in use; mean scan value; share of the field never seen;
-            mean, mean root and maximum of the covariance norms.
+        context: `[..., 7]` share of slots in use; mean scan value; share of the field never seen;
+            mean, mean root and maximum of the covariance norms; whether there are as many confirmed
+            tracks as there can be truths (all count where variances are not observed).
     """
 
     search: jax.Array  # [..., 9, K]
     inside: jax.Array  # [..., T, K] bool
     tracks: jax.Array  # [..., T, F]
     mask: jax.Array  # [..., T] bool
-    context: jax.Array  # [..., 6]
+    context: jax.Array  # [..., 7]
 
     def first_tracks(self, length: int) -> "BeamInputs":
         """The same with the first `length` slots for tracks."""
@@ -96,15 +97,17 @@ class BeamGeometry:
         scan_value, unseen = jax.vmap(self.scan_values)(jnp.stack([scan_map, scan_map**SHARPNESS]))
         nearest = jax.vmap(look_number, in_axes=(0, None, None))(angles, self.static, self.params)
         own = [tracks, jnp.sqrt(norm)[:, None], jnp.where(mask, scan_value[nearest], 0.0)[:, None]]
+        sure = mask
         if "variances" in observation:
             variances = jnp.where(mask[:, None], observation["variances"], 0.0)
             own += [variances, jnp.sqrt(variances), self._needs(tracks[:, 0], variances)]
+            sure = confirmed(mask, variances[:, 1] * self.params.deletion_threshold, self.params)
         return BeamInputs(
             search=self._search(scan_value, unseen),
             inside=in_beams(towards, self.looks, self.params) & mask[:, None],
             tracks=jnp.concatenate(own, axis=-1),
             mask=mask,
-            context=self._context(norm, mask, scan_map),
+            context=self._context(norm, mask, sure, scan_map),
         )
 
     def _needs(self, distance: jax.Array, variances: jax.Array) -> jax.Array:
@@ -122,11 +125,12 @@ class BeamGeometry:
         own = [scan_value, unseen, worth, unseen * self.areas]
         return jnp.stack([*own, around, unseen * around, *places, planned])
 
-    def _context(self, norm: jax.Array, mask: jax.Array, scan_map: jax.Array) -> jax.Array:
+    def _context(self, norm: jax.Array, mask: jax.Array, sure: jax.Array, scan_map: jax.Array) -> jax.Array:
         number = jnp.maximum(mask.sum(), 1)
         never_seen = (scan_map > NEVER_SEEN).mean()
         norms = [norm.sum() / number, jnp.sqrt(norm).sum() / number, norm.max()]
-        return jnp.stack([mask.mean(), scan_map.mean(), never_seen, *norms])
+        complete = sure.sum() >= self.static.num_truths
+        return jnp.stack([mask.mean(), scan_map.mean(), never_seen, *norms, complete.astype(norm.dtype)])
 
 
 def mean_of_neighbours(grid: jax.Array) -> jax.Array:

@@ -51,7 +51,7 @@ class TrainConfig:
     pretrain_steps: int = 0
     """Environment steps with random looks on which one of the paper's encoders learns to reproduce track
     lists, as an auto-encoder, before anything else."""
-    warm_start: str = "sweep"
+    warm_start: str = "sweep_then_track"
     """Rule that the policy imitates at first, a baseline by name; none: it learns from rewards alone."""
     warm_start_steps: int = 150_000
     """Environment steps of that, out of the total, rounded down to whole updates."""
@@ -67,7 +67,7 @@ class TrainConfig:
     microbatch: int = 0
     """Samples per piece of a gradient, for the cache; changes nothing but speed and rounding. 0: at
     most 128 for beams, 32 for the paper's encoders."""
-    learning_rate: float = 3e-5
+    learning_rate: float = 1e-5
     """Adam's step size when learning from rewards starts. Without a warm start, 3e-3 learns faster."""
     anneal: bool = True
     """Let the learning rate fall to zero from there, linearly."""
@@ -111,7 +111,9 @@ class TrainConfig:
     """Digest of that file; it is filled in, and a file with another one is refused."""
 
     static: StaticParams = dataclasses.field(
-        default_factory=lambda: StaticParams(reward="shortfall", search_sharpness=16, observe_variances=True)
+        default_factory=lambda: StaticParams(
+            reward="shortfall", search_sharpness=16, search_until_complete=True, observe_variances=True
+        )
     )
     """Shapes of the environment."""
     params: Params = dataclasses.field(default_factory=lambda: Params(search_weight=3.0))

@@ -40,9 +40,9 @@ class PaperNetwork(nn.Module):
 
     The paper's head is "factored": azimuth and elevation each on their own
     (`train.distributions.FACTORED`). "joint" is one softmax over all looks, and "beams" makes their
-    logits from prices of what they search and from urgencies of the tracks in their beams
-    (`train.beams`); both are `train.distributions.JOINT`. "gaussian" is for continuous actions: the
-    moments of azimuth and elevation (`train.distributions.Gaussian`).
+    logits from prices of what they search and from urgencies of the tracks in their beams, in the light
+    of the beams' context too (`train.beams`); both are `train.distributions.JOINT`. "gaussian" is for
+    continuous actions: the moments of azimuth and elevation (`train.distributions.Gaussian`).
     """
 
     encoder: str = "mhsa"
@@ -75,7 +75,9 @@ class PaperNetwork(nn.Module):
             raise ValueError(f"head = {self.head!r}: expected one of {', '.join(HEADS)}")
         z_sh = NatureCNN(name="scan_map")(observation["scan_map"])
         z_tl = ENCODERS[self.encoder](name="track_list")(observation["tracks"], observation["mask"])
-        z = jnp.concatenate([z_sh, z_tl], axis=-1)
+        # What is known of all tracks, such as whether they are enough, comes to this head unencoded.
+        known = [observation["beams"].context] if self.head == "beams" else []
+        z = jnp.concatenate([z_sh, z_tl, *known], axis=-1)
         value = MLP((self.width, self.width), 1, 1.0, name="value")(z)
         return self._logits(z, observation), value[..., 0]
 

@@ -13,7 +13,7 @@ from train.beams import BeamGeometry, BeamInputs, BeamNetwork, mean_of_neighbour
 pytestmark = pytest.mark.usefixtures("quick_compilation")
 
 L, M, T = 5, 9, 4
-STATIC = StaticParams(max_tracks=T, map_size=M, num_looks=L)
+STATIC = StaticParams(num_truths=3, max_tracks=T, map_size=M, num_looks=L)
 # Looks lie 30 degrees apart, pixels 15 degrees; a beam reaches 0.3 rad = 17 degrees to each side.
 PARAMS = Params(beam_azimuth=0.6, beam_elevation=0.6)
 ON_TRACK, CENTRE = 3 * L + 1, 2 * L + 2
@@ -111,9 +111,25 @@ def test_neighbours_outside_the_field_count_nothing():
 def test_the_context_is_of_the_whole_picture(features):
     context = features(observe(track(0.04), track(0.16), track(0.36))).context
     root = (0.2 + 0.4 + 0.6) / 3
-    np.testing.assert_allclose(context, [3 / 4, 40 / 81, 0, 0.56 / 3, root, 0.36], rtol=1e-5)
+    np.testing.assert_allclose(context, [3 / 4, 40 / 81, 0, 0.56 / 3, root, 0.36, 1], rtol=1e-5)
     # 40/81 is the mean of 0..80 over 81. Without a track the norms are 0, not NaN.
-    np.testing.assert_allclose(features(observe(seen=False)).context, [0, 1, 1, 0, 0, 0], rtol=1e-5)
+    np.testing.assert_allclose(features(observe(seen=False)).context, [0, 1, 1, 0, 0, 0, 0], rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("tracks", "of_velocity", "complete"),
+    [
+        (2, [0.1, 0.1, 0.1, 0.1], 0),
+        (3, [0.1, 0.2, 0.48, 0.1], 1),
+        (3, [0.1, 0.2, 0.49, 0.1], 0),  # 0.9 x 3 x 30^2 / 5000 = 0.486: a track of one detection
+        (4, [0.1, 0.2, 0.49, 0.1], 1),
+        (3, [0.1, 0.2, jnp.nan, 0.1], 0),
+    ],
+)
+def test_the_context_tells_whether_all_truths_have_confirmed_tracks(features, tracks, of_velocity, complete):
+    variances = jnp.stack([jnp.full(T, 0.1), jnp.asarray(of_velocity)], axis=-1)
+    observation = {**observe(*[track(0.2)] * tracks), "variances": variances}
+    assert features(observation).context[-1] == complete
 
 
 def test_empty_rows_may_hold_anything(features):
@@ -128,11 +144,11 @@ def drawn(draw_variables):
     rng = np.random.default_rng(0)
     mask = np.broadcast_to(np.arange(T) < 3, (3, T))
     inputs = BeamInputs(
-        search=jnp.asarray(rng.uniform(0, 1, (3, 8, L * L)), dtype=float),
+        search=jnp.asarray(rng.uniform(0, 1, (3, 9, L * L)), dtype=float),
         inside=jnp.asarray((rng.uniform(0, 1, (3, T, L * L)) < 0.3) & mask[..., None]),
         tracks=jnp.asarray(rng.uniform(0, 1, (3, T, 9)) * mask[..., None], dtype=float),
         mask=jnp.asarray(mask),
-        context=jnp.asarray(rng.uniform(0, 1, (3, 6)), dtype=float),
+        context=jnp.asarray(rng.uniform(0, 1, (3, 7)), dtype=float),
     )
     network = BeamNetwork(width=8)
     return jax.jit(network.apply), draw_variables(network, inputs), inputs

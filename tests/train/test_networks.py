@@ -110,6 +110,10 @@ def test_the_beams_head_tells_what_lies_in_each_beam(apply, observation, draw_va
     changed = np.asarray(apply(network, variables, nowhere)[0] != logits)
     assert beams.inside[:, 0].any()
     np.testing.assert_array_equal(changed, beams.inside[:, 0])
+    told = beams.replace(context=beams.context.at[:, -1].add(1))
+    policy, value = apply(network, variables, {**whole, "beams": told})
+    assert np.all(np.any(policy != logits, axis=1)), "the context is read"
+    assert np.all(value != apply(network, variables, {**whole, "beams": beams})[1])
     # No search: what is left are the tracks, and looks that hold none are all alike.
     searched = beams.replace(search=jnp.zeros_like(beams.search))
     rest = np.asarray(apply(network, variables, {**whole, "beams": searched})[0])
