@@ -109,10 +109,11 @@ def time_stone_soup(look: Look, static: StaticParams, params: Params, steps: int
     return Timing(steps / (time.perf_counter() - began), detections, live_tracks)
 
 
-POLICIES: dict[str, tuple[policies.PolicyBuilder, Look]] = {
-    "random": (policies.random, random_look),
+POLICIES: dict[str, tuple[policies.PolicyBuilder | None, Look]] = {
+    "random": (None, random_look),
     "pointing": (pointing, pointing_look),
 }
+"""Our side, None for looks drawn before the first step, and theirs."""
 
 
 def measure(

@@ -35,30 +35,51 @@ def play(
     start: Start,
     params: Params,
     env: SearchTrack,
-    build: policies.PolicyBuilder,
+    build: policies.PolicyBuilder | None,
     steps: int,
 ) -> tuple[Start, dict[str, jax.Array]]:
     """Steps the environments of `start` `[B]`, each with its key of `keys` `[B]`, through gymnax's `step`.
+
+    Args:
+        keys: of the environments.
+        start: where they are.
+        params: numbers.
+        env: the environment.
+        build: of the policy; None for looks drawn uniformly, all of them before the first step.
+        steps: to take.
 
     Returns:
         The last observation and state, and the means `[B]` of reward and of every scalar of
         `info`: all of them are asked for, so that none is optimised away.
     """
-    policy = build(env.static, params)
+    policy = build(env.static, params) if build else None
     policy_keys, step_keys = jax.vmap(split)(keys)
     of_steps = jax.vmap(lambda key: jax.random.split(key, steps), out_axes=1)(step_keys)
+    drawn = None if policy else random_actions(policy_keys, steps, env.static, params)
 
-    def one_step(carry: Start, keys: jax.Array) -> tuple[Start, dict[str, jax.Array]]:
-        _, state = carry
-        action = jax.vmap(policy)(policy_keys, state)
+    def one_step(
+        carry: Start, of_step: tuple[jax.Array, jax.Array | None]
+    ) -> tuple[Start, dict[str, jax.Array]]:
+        (_, state), (keys, action) = carry, of_step
+        action = jax.vmap(policy)(policy_keys, state) if policy else action
         observation, state, reward, _, _, info = jax.vmap(env.step, in_axes=(0, 0, 0, None))(
             keys, state, action, params
         )
         del info["final_observation"], observation["scan_map"]
         return (observation, state), {**info, "reward": reward}
 
-    end, logged = jax.lax.scan(one_step, start, of_steps)
+    end, logged = jax.lax.scan(one_step, start, (of_steps, drawn))
     return end, jax.tree.map(lambda values: jnp.mean(values, axis=0), logged)
+
+
+def random_actions(keys: jax.Array, steps: int, static: StaticParams, params: Params) -> jax.Array:
+    """Uniformly drawn actions `[steps, B, 2]`, for each key all in one draw of many numbers."""
+
+    def draw(key: jax.Array) -> jax.Array:
+        looks = jax.random.randint(key, (steps,), 0, static.num_looks**2)
+        return jax.vmap(lambda look: policies.to_action(look, static, params))(looks)
+
+    return jax.vmap(draw, out_axes=1)(keys)
 
 
 def begin(keys: jax.Array, params: Params, env: SearchTrack) -> Start:
@@ -79,7 +100,7 @@ def compile_play(
     env: SearchTrack,
     params: Params,
     start: Start,
-    build: policies.PolicyBuilder,
+    build: policies.PolicyBuilder | None,
     steps: int,
     shared: bool = True,
 ) -> tuple[Any, float]:
