@@ -18,7 +18,7 @@ from train.vision import SMALLEST_MAP
 NO_WARM_START = "none"
 
 PIECE_SIZES = {"beams": 128}
-"""Samples per piece of a gradient that suit an agent's network; 32 where nothing is said."""
+"""Samples per piece of a gradient that suit an agent's network; 64 where nothing is said."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -133,7 +133,7 @@ class TrainConfig:
     def piece_size(self) -> int:
         """Samples per piece of a gradient: `microbatch`, or the largest divisor that suits the encoder."""
         own = self.minibatch_size // max(1, self.devices)
-        return self.microbatch or math.gcd(own, PIECE_SIZES.get(self.encoder, 32))
+        return self.microbatch or math.gcd(own, PIECE_SIZES.get(self.encoder, 64))
 
     @property
     def group_size(self) -> int:

@@ -1,6 +1,7 @@
 """What the tests of networks share."""
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -24,6 +25,22 @@ def draw_variables():
         return jax.tree.map(weights, jax.eval_shape(module.init, jax.random.key(0), *inputs))
 
     return draw
+
+
+@pytest.fixture(scope="session")
+def values_and_gradients():
+    """Outputs of `apply(variables, inputs)`, and gradients of a weighted sum of them for both."""
+
+    def compute(apply, variables, inputs):
+        def loss(variables, inputs):
+            out = apply(variables, inputs)
+            return jnp.sum(out * jnp.cos(jnp.arange(out.size).reshape(out.shape))), out
+
+        pull = jax.value_and_grad(loss, argnums=(0, 1), has_aux=True)
+        (_, out), gradients = jax.jit(pull)(variables, inputs)
+        return out, gradients
+
+    return compute
 
 
 @pytest.fixture(scope="session")

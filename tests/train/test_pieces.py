@@ -98,7 +98,7 @@ def test_samples_are_sorted_by_length_only_where_that_is_of_use():
 def test_the_size_of_a_piece_suits_the_encoder_and_divides_the_minibatch():
     free = dataclasses.replace(CONFIG, microbatch=0, num_envs=64, rollout_steps=128, num_minibatches=8)
     assert dataclasses.replace(free, encoder="beams").piece_size == 128
-    assert dataclasses.replace(free, encoder="mhsa").piece_size == 32
+    assert dataclasses.replace(free, encoder="mhsa").piece_size == 64
     assert dataclasses.replace(free, encoder="mhsa", rollout_steps=10).piece_size == 16
-    assert dataclasses.replace(free, microbatch=64).piece_size == 64
+    assert dataclasses.replace(free, microbatch=32).piece_size == 32
     assert dataclasses.replace(free, encoder="beams", devices=16).piece_size == 64
