@@ -87,11 +87,25 @@ def test_looks_follow_the_same_rules_on_both_sides():
     assert sum(name == "pointing" for name, _ in seen) >= 3
 
 
-def test_random_looks_cover_the_field():
+def test_random_looks_cover_the_field_on_both_sides():
     scenario = StoneSoupScenario(STATIC, PARAMS)
     rng = np.random.default_rng(0)
-    looks = {tuple(stone_soup.random_look(scenario, rng).tolist()) for _ in range(1000)}
-    assert looks == {(i, j) for i in range(STATIC.num_looks) for j in range(STATIC.num_looks)}
+    field = {(i, j) for i in range(STATIC.num_looks) for j in range(STATIC.num_looks)}
+    assert {tuple(stone_soup.random_look(scenario, rng).tolist()) for _ in range(1000)} == field
+    ours = playing.random_actions(jax.random.split(jax.random.key(0), 3), 1000, STATIC, PARAMS)
+    assert ours.shape == (1000, 3, 2)
+    for looks in np.moveaxis(np.asarray(ours), 1, 0):
+        assert {tuple(look) for look in looks.tolist()} == field
+    assert np.mean(ours[:, 0] == ours[:, 1]) < 0.3  # every environment has its own
+
+
+def test_without_a_policy_looks_are_random():
+    """Played with one fixed look instead, tracks would be found in its beam alone."""
+    env, params = make(PARAMS, STATIC)
+    keys = jax.random.split(jax.random.key(0), 4)
+    (_, end), _ = playing.play(keys, playing.begin(keys, params, env), params, env, None, 40)
+    seen = np.asarray(end.scan_map) < 1
+    assert np.all(np.mean(seen, axis=(1, 2)) > 0.8)
 
 
 def test_ours_counts_every_step_of_every_environment(monkeypatch):
