@@ -100,7 +100,7 @@ def test_random_looks_cover_the_field_on_both_sides():
 
 
 def test_without_a_policy_looks_are_random():
-    """Played with one fixed look instead, tracks would be found in its beam alone."""
+    """With one look again and again most of the map would stay as it was at the start."""
     env, params = make(PARAMS, STATIC)
     keys = jax.random.split(jax.random.key(0), 4)
     (_, end), _ = playing.play(keys, playing.begin(keys, params, env), params, env, None, 40)

@@ -36,8 +36,8 @@ class NatureCNN(nn.Module):
         for channels, size, stride in LAYERS:
             layers.append(Layer(*Convolution(channels, size)(inputs), stride))
             inputs = channels
-        on_cpu = jax.default_backend() == "cpu" if self.by_matmul is None else self.by_matmul
-        x = (by_matmul if on_cpu else by_xla)(images, layers)
+        as_products = jax.default_backend() == "cpu" if self.by_matmul is None else self.by_matmul
+        x = (by_matmul if as_products else by_xla)(images, layers)
         x = x.reshape(x.shape[0], -1)
         return nn.relu(nn.Dense(self.features, kernel_init=orthogonal(GAIN))(x))
 
